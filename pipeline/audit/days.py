@@ -15,18 +15,9 @@ from pipeline.rig.se3 import change_between, change_jacobian, changed
 from schemas.calibrations import DOF_NAMES
 
 __all__ = [
-    "DOFS",
-    "FEWEST_DAYS",
-    "PairDays",
-    "Reference",
-    "charted",
-    "charts_of_fleet",
-    "clipped_days",
-    "edges_of_fleet",
-    "pair_days",
-    "reference_of",
-    "with_reference",
-]
+    "DOFS", "FEWEST_DAYS", "PairDays", "Reference", "charted", "charts_of_fleet", "clipped_days",
+    "edges_of_fleet", "pair_days", "reference_of", "with_reference",
+]  # fmt: skip
 
 DOFS = len(DOF_NAMES)
 # Autocorrelation of days whose scatter nobody has seen yet: the most that the budget is proved for.
@@ -92,13 +83,9 @@ class Reference:
 
 
 def pair_days(
-    day: Int[np.ndarray, " N"],
-    T: Float[np.ndarray, "N 4 4"],
-    covariance: Float[np.ndarray, "N 6 6"],
-    common: Float[np.ndarray, "N 6 6"],
-    observable: Bool[np.ndarray, "N 6"],
-    accepted: Bool[np.ndarray, " N"],
-) -> PairDays:
+    day: Int[np.ndarray, " N"], T: Float[np.ndarray, "N 4 4"], covariance: Float[np.ndarray, "N 6 6"],
+    common: Float[np.ndarray, "N 6 6"], observable: Bool[np.ndarray, "N 6"], accepted: Bool[np.ndarray, " N"],
+) -> PairDays:  # fmt: skip
     """Day estimates of an edge, with changes from the first.
 
     `common` is the part of `covariance` from errors common to all days, zero if a record does not have it.
@@ -143,13 +130,9 @@ def _as_charts(days: PairDays) -> Charts:
     """All six DoF; an undetermined one has the prior's sigma."""
     N = len(days.day)
     return Charts(
-        np.broadcast_to(days.day, (DOFS, N)),
-        days.change.T.copy(),
-        days.sigma.T.copy(),
-        np.broadcast_to(days.accepted, (DOFS, N)),
-        np.full(DOFS, days.reference_days),
-        np.full(DOFS, N),
-    )
+        np.broadcast_to(days.day, (DOFS, N)), days.change.T.copy(), days.sigma.T.copy(),
+        np.broadcast_to(days.accepted, (DOFS, N)), np.full(DOFS, days.reference_days), np.full(DOFS, N),
+    )  # fmt: skip
 
 
 def clipped_days(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
@@ -184,15 +167,11 @@ def with_reference(days: PairDays, reference: Reference) -> PairDays:
     own = days.at(~np.isin(days.day, reference.days))
     T = np.concatenate([reference.T[None], own.T])
     return PairDays(
-        np.concatenate([[reference.days[-1]], own.day]),
-        T,
-        change_between(reference.T, T),
+        np.concatenate([[reference.days[-1]], own.day]), T, change_between(reference.T, T),
         np.concatenate([reference.spread[None], own.spread]),
-        np.concatenate([reference.observable[None], own.observable]),
-        np.concatenate([[True], own.accepted]),
-        reference.T,
-        reference_days=len(reference.days),
-    )
+        np.concatenate([reference.observable[None], own.observable]), np.concatenate([[True], own.accepted]),
+        reference.T, reference_days=len(reference.days),
+    )  # fmt: skip
 
 
 def edges_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]]) -> tuple[Edge, ...]:
@@ -229,10 +208,6 @@ def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Ed
     last = np.take_along_axis(day, np.maximum(count - 1, 0)[..., None], -1)
     day, flat = np.where(column >= count[..., None], last, day), (-1, shape[3])
     return Charts(
-        day.reshape(flat),
-        value.reshape(flat),
-        sigma.reshape(flat),
-        accepted.reshape(flat),
-        reference_days.ravel(),
-        count.ravel(),
-    )
+        day.reshape(flat), value.reshape(flat), sigma.reshape(flat), accepted.reshape(flat),
+        reference_days.ravel(), count.ravel(),
+    )  # fmt: skip

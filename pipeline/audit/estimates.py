@@ -22,17 +22,9 @@ from schemas.calibrations import CALIBRATIONS, STATUSES
 from schemas.columns import POSE_COLUMNS
 
 __all__ = [
-    "COLUMNS",
-    "Estimates",
-    "day_name",
-    "days_of",
-    "estimates_at",
-    "estimates_of",
-    "faults_of",
-    "is_covariance",
-    "is_rigid",
-    "joined",
-]
+    "COLUMNS", "Estimates", "day_name", "days_of", "estimates_at", "estimates_of", "faults_of",
+    "is_covariance", "is_rigid", "joined",
+]  # fmt: skip
 
 _ROUNDING = 1e-3  # of what should be 1
 _SHIFTS = tuple(f"diagnostics.holdout_{n}_shift_rad" for n in ("azimuth", "elevation"))

@@ -116,14 +116,10 @@ def _what_happened(alarm: DriftFinding) -> str:
 
 
 def vehicle_findings(
-    about: tuple[str, str, str],
-    records: Estimates,
-    verdict: VehicleVerdict,
-    config: AuditConfig,
-    remarks: Mapping[tuple[Edge, str], str],
-    before: Mapping[tuple[Edge, str], DriftFinding],
+    about: tuple[str, str, str], records: Estimates, verdict: VehicleVerdict, config: AuditConfig,
+    remarks: Mapping[tuple[Edge, str], str], before: Mapping[tuple[Edge, str], DriftFinding],
     edges: Sequence[Edge],
-) -> list[DriftFinding]:
+) -> list[DriftFinding]:  # fmt: skip
     """Rows in order of edge and DoF; a DoF without a chart has a reason. Only edges of the vehicle have rows.
 
     Args:
@@ -155,15 +151,11 @@ def vehicle_findings(
     status = decide_status(findings)
     return [
         replace(
-            f,
-            vehicle_status=status.status,
-            vehicle_sensor=status.sensor,
-            vehicle_since=status.since,
-            vehicle_reason=status.reason,
-            vehicle_days_needed=status.days_needed,
+            f, vehicle_status=status.status, vehicle_sensor=status.sensor, vehicle_since=status.since,
+            vehicle_reason=status.reason, vehicle_days_needed=status.days_needed,
         )
         for f in findings
-    ]
+    ]  # fmt: skip
 
 
 def _change_columns(chart: ChartVerdict, edge: Edge, found: Attribution | None) -> dict[str, Any]:

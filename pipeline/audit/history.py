@@ -97,13 +97,9 @@ class History:
         return joined([known, *self.references(begin, window, events, count, lacking)]), made
 
     def references(
-        self,
-        begin: Mapping[str, str],
-        window: tuple[str, str],
-        events: Mapping[str, Sequence[ServiceEvent]],
-        count: int,
-        asked: Mapping[tuple[str, Edge], str | None],
-    ) -> Iterator[Estimates]:
+        self, begin: Mapping[str, str], window: tuple[str, str], events: Mapping[str, Sequence[ServiceEvent]],
+        count: int, asked: Mapping[tuple[str, Edge], str | None],
+    ) -> Iterator[Estimates]:  # fmt: skip
         """Records of the first accepted days of edges since their last service event.
 
         `begin` is the day from which each vehicle's records are known already; `asked` has the edges, with

@@ -132,16 +132,12 @@ def _sensor(rows: pa.Table) -> SensorDays:
     moved = np.array([_MOVED in (faults or ()) for faults in rows["faults"].to_pylist()], bool)
     last = tuple(str(rows[name][-1].as_py()) for name in ("day", "status", "reason"))
     return SensorDays(
-        PoseDays(days[kept], pose[kept], C[kept], B[kept], prior[kept], P[kept]),
-        accepted[kept],
-        observable_dofs(rows["observable"])[kept],
-        tuple(keys[k] for k in kept.tolist()),
-        targets[seen[-1]] if len(seen) else None,
-        (prior[known[-1]], P[known[-1]]) if len(known) else None,
-        (last[0], last[1], last[2]),
-        PoseDays(days[left], pose[left], C[left], B[left], prior[left], P[left]),
+        PoseDays(days[kept], pose[kept], C[kept], B[kept], prior[kept], P[kept]), accepted[kept],
+        observable_dofs(rows["observable"])[kept], tuple(keys[k] for k in kept.tolist()),
+        targets[seen[-1]] if len(seen) else None, (prior[known[-1]], P[known[-1]]) if len(known) else None,
+        (last[0], last[1], last[2]), PoseDays(days[left], pose[left], C[left], B[left], prior[left], P[left]),
         days[moved & ~counts],
-    )
+    )  # fmt: skip
 
 
 def _transforms(rows: pa.Table, names: Sequence[str]) -> Float[np.ndarray, "N 4 4"]:

@@ -31,16 +31,9 @@ from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 
 __all__ = [
-    "Kept",
-    "drift_per_day",
-    "events_until",
-    "first_accepted",
-    "kept_columns",
-    "kept_of",
-    "last_restart",
-    "read_kept",
-    "restart_of",
-]
+    "Kept", "drift_per_day", "events_until", "first_accepted", "kept_columns", "kept_of", "last_restart",
+    "read_kept", "restart_of",
+]  # fmt: skip
 
 _COLUMNS = tuple(c.name for c in STATES.columns if c.name.startswith("reference_"))
 # Records that were committed while a night's audit ran may be younger than what it read, and older than its states.

@@ -159,13 +159,9 @@ def _sensor_row(
     left_out = ", ".join(names[k] for k in found.left_out)
     remarks += [because("differ", days=left_out)] if left_out else []
     row = replace(
-        base,
-        **_columns(pose),
-        status="current",
-        reason=_sentences([why, *remarks]),
-        days=[names[k] for k in found.rows],
-        inputs=sorted({counted.work_keys[k] for k in found.rows}),
-    )
+        base, **_columns(pose), status="current", reason=_sentences([why, *remarks]),
+        days=[names[k] for k in found.rows], inputs=sorted({counted.work_keys[k] for k in found.rows}),
+    )  # fmt: skip
     return row, pose
 
 
@@ -181,13 +177,9 @@ def _counted(
 
 
 def _edge_row(
-    empty: StateRow,
-    edge: Edge,
-    targets: Float[np.ndarray, "3 3"] | None,
-    rows: Mapping[str, StateRow],
-    poses: Mapping[str, _Pose],
-    verify: VerifyConfig,
-) -> StateRow:
+    empty: StateRow, edge: Edge, targets: Float[np.ndarray, "3 3"] | None, rows: Mapping[str, StateRow],
+    poses: Mapping[str, _Pose], verify: VerifyConfig,
+) -> StateRow:  # fmt: skip
     """The row of an edge, composed of the poses of its ends."""
     base = replace(empty, pair=edge.kind, parent_frame=edge.parent.name, child_frame=edge.child.name)
     lacking = [sensor.name for sensor in edge.sensors if sensor.name not in poses]

@@ -154,13 +154,9 @@ def _window(task: Task, audited: str | None) -> tuple[str, str]:
 
 
 def _findings(
-    fleet: FleetConfig,
-    name: str,
-    vehicle: _Vehicle,
-    verdict: VehicleVerdict,
-    window: tuple[str, str, str],
+    fleet: FleetConfig, name: str, vehicle: _Vehicle, verdict: VehicleVerdict, window: tuple[str, str, str],
     known: tuple[Mapping[tuple[Edge, str], FleetShift], Mapping[tuple[Edge, str], DriftFinding]],
-) -> list[DriftFinding]:
+) -> list[DriftFinding]:  # fmt: skip
     (first, last, method), (shifts, before) = window, known
     records = vehicle.records.at(np.flatnonzero(vehicle.records.day >= _ordinal(first)))
     inputs = records.keys()

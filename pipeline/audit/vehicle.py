@@ -247,10 +247,7 @@ class Whitened:
 
     @classmethod
     def of(
-        cls,
-        days: PairDays,
-        autocorrelation: Float[np.ndarray, " 6"],
-        wander: Float[np.ndarray, " 6"],
+        cls, days: PairDays, autocorrelation: Float[np.ndarray, " 6"], wander: Float[np.ndarray, " 6"]
     ) -> Whitened:
         """Days whitened for this autocorrelation per axis and for a level that gains variance `wander` a day."""
         N, sigma = len(days.day), days.sigma

@@ -104,21 +104,12 @@ def judge_charts(
     drifts = z[1] / limits[1] > z[0] / limits[0]
     last_day, last_size = _last_day(charts, noise)
     seen = _Judged(
-        charts,
-        value,
-        noise,
-        limit,
-        found,
-        np.where(drifts, z[1], z[0]),
-        np.where(drifts, limits[1], limits[0]),
-        np.stack(limits[2:]),
-        np.where(noise.heavy, _TAME + 1, _TAME),
-        _VISIBLE_SIGMAS * found.sigma.min(axis=1, initial=np.inf),
-        last_day,
+        charts, value, noise, limit, found, np.where(drifts, z[1], z[0]),
+        np.where(drifts, limits[1], limits[0]), np.stack(limits[2:]), np.where(noise.heavy, _TAME + 1, _TAME),
+        _VISIBLE_SIGMAS * found.sigma.min(axis=1, initial=np.inf), last_day,
         np.maximum(np.where(drifts, limits[1], limits[0]), 3 * (noise.far / probability[1]) ** (1 / _TAIL)),
-        last_size,
-        baseline_days,
-    )
+        last_size, baseline_days,
+    )  # fmt: skip
     return [_verdict(seen, m) for m in range(len(charts.count))]
 
 

@@ -255,16 +255,12 @@ def _of_rig(solved: SolvedEdge, rig: AdjustedRig, estimates: Mapping[Edge, PairE
     dt = {n: rig.poses.dt_s.get(n, 0.0) for n in (parent, child)}
     sigmas = [rig.sensors[n].dt_sigma_s for n in (parent, child) if n in rig.sensors]
     return replace(
-        own,
-        T=rig.poses.between(parent, child),
-        covariance=rig.poses.covariance_between(parent, child),
+        own, T=rig.poses.between(parent, child), covariance=rig.poses.covariance_between(parent, child),
         common_covariance=rig.poses.covariance_between(parent, child, common=True),
-        observability=observability,
-        observable=observability >= OBSERVABLE,
-        frames_used=max(own.frames_used, min(others, default=0)),
-        time_offset_s=dt[child] - dt[parent],
+        observability=observability, observable=observability >= OBSERVABLE,
+        frames_used=max(own.frames_used, min(others, default=0)), time_offset_s=dt[child] - dt[parent],
         time_offset_sigma_s=float(np.hypot.reduce(sigmas)),
-    )
+    )  # fmt: skip
 
 
 def _expected_clocks(graph: RigGraph, clocks: Mapping[Edge, float]) -> dict[str, float]:

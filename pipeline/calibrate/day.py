@@ -36,13 +36,9 @@ _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost ti
 
 
 def solve_day(
-    observations: Sequence[Observation],
-    prior: Prior,
-    fleet: FleetConfig,
-    about: Inputs,
-    progress: Progress = silent,
-    solver: Solver | None = None,
-) -> tuple[list[CalibrationRecord], list[SolvedEdge]]:
+    observations: Sequence[Observation], prior: Prior, fleet: FleetConfig, about: Inputs,
+    progress: Progress = silent, solver: Solver | None = None,
+) -> tuple[list[CalibrationRecord], list[SolvedEdge]]:  # fmt: skip
     """Select, trigger, solve, judge, each pair by its own frames: records of refused pairs, and the others.
 
     `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
@@ -65,14 +61,9 @@ def _named(refusal: SolveError, wrong: Sequence[Check]) -> SolveError:
 
 
 def _solved(
-    observations: Sequence[Observation],
-    prior: Prior,
-    fleet: FleetConfig,
-    about: Inputs,
-    motion: MotionFindings,
-    progress: Progress,
-    solver: Solver | None,
-) -> tuple[list[CalibrationRecord], list[SolvedEdge]]:
+    observations: Sequence[Observation], prior: Prior, fleet: FleetConfig, about: Inputs,
+    motion: MotionFindings, progress: Progress, solver: Solver | None,
+) -> tuple[list[CalibrationRecord], list[SolvedEdge]]:  # fmt: skip
     """A day whose sources of motion were compared."""
     progress(0, 4, "select frames")
     labels = day_labels(observations, float(np.radians(fleet.verify.camera_lidar_limit_deg)))
@@ -94,13 +85,9 @@ def _solved(
     active = _to_calibrate(method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
     solution = (solver or method.solver())(
-        frames,
-        prior,
-        fleet.solve,
-        seed=about.seed,
-        triggered=active,
+        frames, prior, fleet.solve, seed=about.seed, triggered=active,
         progress=lambda done, total, what: progress(1, 4, f"{what} ({done}/{total})"),
-    )
+    )  # fmt: skip
     if labels is not None and "camera_lidar" in active:
         solution = labels.judged(solution)
     progress(2, 4, "judge on held-out frames")
@@ -110,18 +97,9 @@ def _solved(
     judged = _judged(solution, failed, judging, method.composed if len(pairs) == len(PAIRS) else ())
     doubted = {pair: estimate.doubted(judged[pair].doubt) for pair, estimate in solution.pairs.items()}
     day = SolvedDay(
-        observations,
-        selection,
-        prior,
-        replace(solution, pairs=doubted),
-        judged,
-        failed,
-        judging,
-        sample,
-        before,
-        {pair: bool(fired[pair]) for pair in pairs},
-        motion.numbers,
-    )
+        observations, selection, prior, replace(solution, pairs=doubted), judged, failed, judging, sample,
+        before, {pair: bool(fired[pair]) for pair in pairs}, motion.numbers,
+    )  # fmt: skip
     progress(4, 4, "done")
     return refusals, [_edge(day, about, pair) for pair in day.solution.pairs]
 
@@ -163,26 +141,16 @@ def _selection(
     if gate_s is None and method.paper_selection:
         gate_s = PAPER_SYNC_GATE_S
     return select_frames(
-        observations,
-        select,
-        paper=method.paper_selection,
-        sync_gate_s=gate_s,
+        observations, select, paper=method.paper_selection, sync_gate_s=gate_s,
         motion_gate=None if gate_s else (gates.sync_gate_m, float(np.radians(gates.sync_gate_deg))),
-        pairs=about.pairs,
-        absent=about.absent,
-    )
+        pairs=about.pairs, absent=about.absent,
+    )  # fmt: skip
 
 
 def _judging(
-    observations: Sequence[Observation],
-    selection: Selection,
-    prior: Prior,
-    solution: Solution,
-    fleet: FleetConfig,
-    active: Sequence[str],
-    motion: MotionFindings,
-    probe_deg: Probes,
-) -> tuple[Mapping[str, Sequence[Check]], Judging]:
+    observations: Sequence[Observation], selection: Selection, prior: Prior, solution: Solution,
+    fleet: FleetConfig, active: Sequence[str], motion: MotionFindings, probe_deg: Probes,
+) -> tuple[Mapping[str, Sequence[Check]], Judging]:  # fmt: skip
     """Failed checks of all pairs, and inputs of their verdicts."""
     seen_by = next((o for o in observations if "camera" in o.sensors), None)
     turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)

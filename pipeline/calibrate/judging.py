@@ -171,17 +171,9 @@ def _claims(
 ) -> dict[str, Claim]:
     azimuth_rad, elevation_rad = verify.limits_rad(estimate.pair)
     return claims_of(
-        estimate.pair,
-        estimate.T,
-        estimate.covariance,
-        update,
-        azimuth_rad,
-        verify.confidence,
-        verify.checks.held_out_contradiction_sigmas,
-        elevation_rad,
-        mounting,
-        targets,
-    )
+        estimate.pair, estimate.T, estimate.covariance, update, azimuth_rad, verify.confidence,
+        verify.checks.held_out_contradiction_sigmas, elevation_rad, mounting, targets,
+    )  # fmt: skip
 
 
 def probe_numbers(

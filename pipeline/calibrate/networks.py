@@ -53,28 +53,16 @@ def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
     fleet, lake, partition = task.fleet, task.lake, task.partition
 
     def solve(
-        observations: Mapping[str, Sequence[Observation]],
-        prior: Prior,
-        config: SolveConfig,
-        *,
-        seed: int,
-        triggered: Sequence[str],
-        progress: Progress,
-    ) -> Solution:
+        observations: Mapping[str, Sequence[Observation]], prior: Prior, config: SolveConfig, *, seed: int,
+        triggered: Sequence[str], progress: Progress,
+    ) -> Solution:  # fmt: skip
         if ingested(lake, partition) is None:
             raise SolveError(because("no images", method=method))
         networks = open_networks(model_files(method, fleet), fleet.learn, fleet.prepare)
         solution = solve_by_networks(
-            observations,
-            prior,
-            networks=networks,
-            frames=_frames_of(lake, partition, chosen),
-            method=method,
-            seed=seed,
-            clock_sigma_s=config.time_offset_sigma_s,
-            triggered=triggered,
-            progress=progress,
-        )
+            observations, prior, networks=networks, frames=_frames_of(lake, partition, chosen), method=method,
+            seed=seed, clock_sigma_s=config.time_offset_sigma_s, triggered=triggered, progress=progress,
+        )  # fmt: skip
         if "doppler" in config.terms:
             solution = informed_by_way(solution, observations["lidar_radar"], prior)
         if not config.polish:
@@ -144,14 +132,9 @@ def _one_observation(
 
 
 def _polished(
-    solution: Solution,
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    config: SolveConfig,
-    seed: int,
-    triggered: Sequence[str],
-    progress: Progress,
-) -> Solution:
+    solution: Solution, observations: Mapping[str, Sequence[Observation]], prior: Prior, config: SolveConfig,
+    seed: int, triggered: Sequence[str], progress: Progress,
+) -> Solution:  # fmt: skip
     """Method `joint`, started where the networks point."""
     start = replace(
         prior, T_camera_lidar=solution.pairs["camera_lidar"].T, T_lidar_radar=solution.pairs["lidar_radar"].T

@@ -25,19 +25,9 @@ from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 
 __all__ = [
-    "Minimum",
-    "PairProblem",
-    "at_border",
-    "estimate_of",
-    "half_widths",
-    "joint_costs",
-    "loop_size",
-    "minimise",
-    "pair_problem",
-    "solve_joint_optimisation",
-    "solve_pair",
-    "solve_pairwise",
-]
+    "Minimum", "PairProblem", "at_border", "estimate_of", "half_widths", "joint_costs", "loop_size",
+    "minimise", "pair_problem", "solve_joint_optimisation", "solve_pair", "solve_pairwise",
+]  # fmt: skip
 
 # --------------------------------------------------------------------------------------------------
 # Method `pairwise-optimisation`: each pair alone minimises the paper's loss.
@@ -92,14 +82,9 @@ def pair_problem(
 
 
 def solve_pairwise(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    config: SolveConfig,
-    *,
-    seed: int,
-    triggered: Sequence[str] = PAIRS,
-    progress: Progress = silent,
-) -> Solution:
+    observations: Mapping[str, Sequence[Observation]], prior: Prior, config: SolveConfig, *, seed: int,
+    triggered: Sequence[str] = PAIRS, progress: Progress = silent,
+) -> Solution:  # fmt: skip
     """Calibrate each triggered pair alone, each with its own random stream; others keep the prior."""
     pairs = {}
     for k, pair in enumerate(PAIRS):
@@ -144,14 +129,10 @@ def estimate_of(
         floor,
     )
     return replace(
-        blank,
-        covariance=covariance,
-        observability=observability,
-        observable=observability > OBSERVABLE,
-        diagnostics=diagnostics,
-        notes=[because("no uncertainty")],
+        blank, covariance=covariance, observability=observability, observable=observability > OBSERVABLE,
+        diagnostics=diagnostics, notes=[because("no uncertainty")],
         common_covariance=common_of(covariance, base, np.diag(np.square(np.repeat(floor, 3)))),
-    )
+    )  # fmt: skip
 
 
 def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float | None, float | None]:
@@ -187,14 +168,9 @@ _SPREAD = 0.2
 
 
 def solve_joint_optimisation(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    config: SolveConfig,
-    *,
-    seed: int,
-    triggered: Sequence[str] = PAIRS,
-    progress: Progress = silent,
-) -> Solution:
+    observations: Mapping[str, Sequence[Observation]], prior: Prior, config: SolveConfig, *, seed: int,
+    triggered: Sequence[str] = PAIRS, progress: Progress = silent,
+) -> Solution:  # fmt: skip
     """Pairwise first, then all triggered pairs at once with the loop; arguments as in `solve_pairwise`."""
     active = [pair for pair in PAIRS if pair in triggered]
     problems = {pair: pair_problem(pair, observations[pair], prior, config) for pair in PAIRS}
@@ -274,13 +250,9 @@ def half_widths(config: SolveConfig, poses: int) -> Float[np.ndarray, " D"]:
 
 
 def minimise(
-    objective: Objective,
-    config: SolveConfig,
-    start: Float[np.ndarray, " D"],
-    rng: np.random.Generator,
-    *,
+    objective: Objective, config: SolveConfig, start: Float[np.ndarray, " D"], rng: np.random.Generator, *,
     spread: float = 1.0,
-) -> Minimum:
+) -> Minimum:  # fmt: skip
     """Minimise over the box: differential evolution (best1bin) on whole generations, then Nelder-Mead from its best.
 
     Args:
@@ -299,18 +271,10 @@ def minimise(
         return objective(np.clip(x, -half, half))
 
     found = differential_evolution(
-        lambda x: counted(x.T),
-        list(zip(-half, half, strict=True)),
-        init=members,
-        maxiter=config.paper_generations,
-        mutation=(0.5, 0.9),
-        recombination=0.8,
-        tol=1e-4,
-        polish=False,
-        vectorized=True,
-        updating="deferred",
-        rng=rng,
-    )
+        lambda x: counted(x.T), list(zip(-half, half, strict=True)), init=members,
+        maxiter=config.paper_generations, mutation=(0.5, 0.9), recombination=0.8, tol=1e-4, polish=False,
+        vectorized=True, updating="deferred", rng=rng,
+    )  # fmt: skip
     simplex = np.vstack([found.x, found.x + np.diag(_SIMPLEX * half)])
     finished = minimize(
         lambda x: float(counted(x[None])[0]),

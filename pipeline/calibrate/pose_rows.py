@@ -39,15 +39,10 @@ _AT_REFERENCE: dict[str, Any] = pose_columns(np.eye(4)) | {
 
 
 def pose_rows(
-    about: Inputs,
-    graph: RigGraph,
-    adjusted: AdjustedRig | None,
-    before: Extrinsics,
-    views: Mapping[str, View],
-    verify: VerifyConfig,
-    judged: Mapping[str, Concluded] | None = None,
+    about: Inputs, graph: RigGraph, adjusted: AdjustedRig | None, before: Extrinsics,
+    views: Mapping[str, View], verify: VerifyConfig, judged: Mapping[str, Concluded] | None = None,
     wrong: Sequence[WrongPrior] = (),
-) -> list[PoseRow]:
+) -> list[PoseRow]:  # fmt: skip
     """A row for each sensor, the reference included.
 
     Args:
@@ -119,25 +114,15 @@ def _as_judged(row: PoseRow, concluded: Concluded | None) -> PoseRow:
             row, azimuth_sigma_rad=record.azimuth_sigma_rad, elevation_sigma_rad=record.elevation_sigma_rad
         )
     return replace(
-        row,
-        status=record.status,
-        reason=record.reason,
-        faults=record.faults,
-        determined=record.determined or [],
-        unsure_only=bool(record.diagnostics.get("unsure_only")),
-    )
+        row, status=record.status, reason=record.reason, faults=record.faults,
+        determined=record.determined or [], unsure_only=bool(record.diagnostics.get("unsure_only")),
+    )  # fmt: skip
 
 
 def _row(
-    about: Inputs,
-    graph: RigGraph,
-    sensor: Sensor,
-    adjusted: AdjustedRig | None,
-    before: Extrinsics,
-    views: Mapping[str, View],
-    verify: VerifyConfig,
-    wrong: Sequence[WrongPrior],
-) -> PoseRow:
+    about: Inputs, graph: RigGraph, sensor: Sensor, adjusted: AdjustedRig | None, before: Extrinsics,
+    views: Mapping[str, View], verify: VerifyConfig, wrong: Sequence[WrongPrior],
+) -> PoseRow:  # fmt: skip
     told = _identity(about, graph.reference, sensor)
     told["view_azimuth_rad"] = _azimuth_seen(views[sensor.name], sensor) if sensor.name in views else None
     if sensor == graph.reference:
@@ -166,24 +151,17 @@ def _row(
     ]
     status, reason = _verdict(sensor, found, claims, determined, doubted)
     return PoseRow(
-        **told,
-        **pose_columns(poses.T[sensor.name]),
+        **told, **pose_columns(poses.T[sensor.name]),
         unsure_only=status == "held" and not found.doubts and not doubted,
         covariance=poses.covariance_between(reference, sensor.name),
         common_covariance=poses.covariance_between(reference, sensor.name, common=True),
-        observability=[float(v) for v in found.observability],
-        observable=[bool(v) for v in found.determined],
-        status=status,
-        reason=reason,
-        faults=["witnesses_disagree"] * bool(found.doubts) + ["prior"] * bool(doubted),
-        determined=determined,
-        targets_m=targets,
-        azimuth_sigma_rad=claims["azimuth"].sigma_rad,
-        elevation_sigma_rad=claims["elevation"].sigma_rad,
-        dt_s=poses.dt_s.get(sensor.name),
-        dt_sigma_s=found.dt_sigma_s,
-        edges=[edge.name for edge in found.rests_on],
-    )
+        observability=[float(v) for v in found.observability], observable=[bool(v) for v in found.determined],
+        status=status, reason=reason,
+        faults=["witnesses_disagree"] * bool(found.doubts) + ["prior"] * bool(doubted), determined=determined,
+        targets_m=targets, azimuth_sigma_rad=claims["azimuth"].sigma_rad,
+        elevation_sigma_rad=claims["elevation"].sigma_rad, dt_s=poses.dt_s.get(sensor.name),
+        dt_sigma_s=found.dt_sigma_s, edges=[edge.name for edge in found.rests_on],
+    )  # fmt: skip
 
 
 def _identity(about: Inputs, reference: Sensor, sensor: Sensor) -> dict[str, Any]:
@@ -208,15 +186,9 @@ def _claims(
     T = poses.between(sensor.name, reference)
     azimuth_rad, elevation_rad = verify.limits_rad(sensor.kind)
     return claims_of(
-        f"{sensor.kind}_{poses.reference.kind}",
-        T,
-        poses.covariance_between(sensor.name, reference),
-        None,
-        azimuth_rad,
-        verify.confidence,
-        elevation_limit_rad=elevation_rad,
-        targets=targets,
-    )
+        f"{sensor.kind}_{poses.reference.kind}", T, poses.covariance_between(sensor.name, reference), None,
+        azimuth_rad, verify.confidence, elevation_limit_rad=elevation_rad, targets=targets,
+    )  # fmt: skip
 
 
 def _doubted(

@@ -265,14 +265,10 @@ def accepted_before(
     if the day alone does not decide, and the result is judged like any other.
     """
     found = read_records(
-        lake,
-        CALIBRATIONS,
-        CalibrationRecord,
-        vehicle=partition.vehicle,
-        first=days_after(partition.day, -_CALENDAR_DAYS_BACK),
-        last=days_after(partition.day, -1),
+        lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle,
+        first=days_after(partition.day, -_CALENDAR_DAYS_BACK), last=days_after(partition.day, -1),
         columns=POSE_COLUMNS,
-    )
+    )  # fmt: skip
     wanted = (edge.parent.name, edge.child.name, method, "accepted")
     records = current_records(found)
     days = sorted({r.day for r in records}, reverse=True)[:_DAYS_BACK]

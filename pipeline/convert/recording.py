@@ -21,16 +21,9 @@ from pipeline.rig.topics import TOPICS, frame_of, topics_of
 from pipeline.store.atomic_write import atomic_write
 
 __all__ = [
-    "Event",
-    "Recording",
-    "ego_events",
-    "fleet_text",
-    "read_bytes",
-    "read_float_rows",
-    "read_json",
-    "read_pcd",
-    "write_log",
-]
+    "Event", "Recording", "ego_events", "fleet_text", "read_bytes", "read_float_rows", "read_json",
+    "read_pcd", "write_log",
+]  # fmt: skip
 
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
@@ -158,14 +151,9 @@ _TURN = '\nturn = { sense = "right", begins_deg = 180.0 }'
 
 
 def fleet_text(
-    name: str,
-    vehicles: Sequence[str],
-    kinds: Mapping[str, Kind],
-    models: tuple[str, str] | None,
-    *,
-    ego: bool,
-    base: bool,
-) -> str:
+    name: str, vehicles: Sequence[str], kinds: Mapping[str, Kind], models: tuple[str, str] | None, *,
+    ego: bool, base: bool,
+) -> str:  # fmt: skip
     """Text of fleet.toml for converted logs.
 
     Args:

@@ -33,24 +33,10 @@ from pipeline.core.sections import (
 from pipeline.rig.rig import SECTIONS, Rig
 
 __all__ = [
-    "TERMS",
-    "AuditConfig",
-    "ChecksConfig",
-    "FleetConfig",
-    "IngestConfig",
-    "LearnConfig",
-    "PerceiveConfig",
-    "PrepareConfig",
-    "ReportConfig",
-    "SelectConfig",
-    "SolveConfig",
-    "TriggerConfig",
-    "VerifyConfig",
-    "config_hash",
-    "load_fleet",
-    "read_toml",
-    "validated",
-]
+    "TERMS", "AuditConfig", "ChecksConfig", "FleetConfig", "IngestConfig", "LearnConfig", "PerceiveConfig",
+    "PrepareConfig", "ReportConfig", "SelectConfig", "SolveConfig", "TriggerConfig", "VerifyConfig",
+    "config_hash", "load_fleet", "read_toml", "validated",
+]  # fmt: skip
 
 _Kind = TypeVar("_Kind", bound=BaseModel)
 _SHORT = {(section, kind) for kind, section in SECTIONS.items()}

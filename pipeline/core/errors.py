@@ -5,22 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 __all__ = [
-    "BoresightError",
-    "CollectedError",
-    "ConfigError",
-    "ContractError",
-    "DamagedError",
-    "DamagedLogError",
-    "DownloadError",
-    "LogError",
-    "MissingExtraError",
-    "MissingLibraryError",
-    "ModelError",
-    "ModelOutputError",
-    "SolveError",
-    "StorageError",
-    "TooMuchMemoryError",
-]
+    "BoresightError", "CollectedError", "ConfigError", "ContractError", "DamagedError", "DamagedLogError",
+    "DownloadError", "LogError", "MissingExtraError", "MissingLibraryError", "ModelError", "ModelOutputError",
+    "SolveError", "StorageError", "TooMuchMemoryError",
+]  # fmt: skip
 
 
 class BoresightError(Exception):

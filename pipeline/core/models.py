@@ -12,17 +12,9 @@ from typing import Any, Final, Literal
 from pipeline.core.errors import ConfigError
 
 __all__ = [
-    "CATALOGUE",
-    "PREFIX",
-    "REQUIRED",
-    "SHIPPED",
-    "ThirdPartyModel",
-    "manifest_text",
-    "named",
-    "semantics_line",
-    "shipped_manifest",
-    "shipped_models",
-]
+    "CATALOGUE", "PREFIX", "REQUIRED", "SHIPPED", "ThirdPartyModel", "manifest_text", "named",
+    "semantics_line", "shipped_manifest", "shipped_models",
+]  # fmt: skip
 
 SHIPPED = Path(__file__).parent.parent / "learn" / "models"
 PREFIX = "shipped:"  # in fleet.toml: `model = "shipped:radar_drivable"`

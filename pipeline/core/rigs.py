@@ -10,20 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 __all__ = [
-    "CameraPrior",
-    "CameraTopics",
-    "EgoTopics",
-    "LidarTopics",
-    "OnnxDrivable",
-    "OnnxPointSemantics",
-    "OnnxSemantics",
-    "Positive",
-    "PriorConfig",
-    "RadarTopics",
-    "Section",
-    "SensorPrior",
-    "TopicSemantics",
-]
+    "CameraPrior", "CameraTopics", "EgoTopics", "LidarTopics", "OnnxDrivable", "OnnxPointSemantics",
+    "OnnxSemantics", "Positive", "PriorConfig", "RadarTopics", "Section", "SensorPrior", "TopicSemantics",
+]  # fmt: skip
 
 Positive = Annotated[float, Field(gt=0)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]

@@ -135,16 +135,10 @@ class RosMessages:
             np.hstack([camera.K, np.zeros((3, 1))]).ravel(),
         )
         return self.make(
-            "sensor_msgs/CameraInfo",
-            header=header,
-            height=camera.height_px,
-            width=camera.width_px,
-            distortion_model=camera.model,
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
+            "sensor_msgs/CameraInfo", header=header, height=camera.height_px, width=camera.width_px,
+            distortion_model=camera.model, binning_x=0, binning_y=0, roi=roi,
             **dict(zip(names, values, strict=True)),
-        )
+        )  # fmt: skip
 
     def cloud(self, header: Any, columns: Mapping[str, np.ndarray]) -> Any:
         """PointCloud2 of columns of float32, uint16 and uint8 (N each), packed in this order."""
@@ -159,17 +153,10 @@ class RosMessages:
             )
             offset += c.dtype.itemsize
         return self.make(
-            "sensor_msgs/PointCloud2",
-            header=header,
-            height=1,
-            width=len(rows),
-            fields=fields,
-            is_bigendian=False,
-            point_step=dtype.itemsize,
-            row_step=dtype.itemsize * len(rows),
-            data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=True,
-        )
+            "sensor_msgs/PointCloud2", header=header, height=1, width=len(rows), fields=fields,
+            is_bigendian=False, point_step=dtype.itemsize, row_step=dtype.itemsize * len(rows),
+            data=np.frombuffer(rows.tobytes(), np.uint8), is_dense=True,
+        )  # fmt: skip
 
     def transforms(self, of_child: Iterable[tuple[Any, str, Float[np.ndarray, "4 4"]]]) -> Any:
         """TFMessage from (header with the parent's frame, child frame, T_parent_child)."""

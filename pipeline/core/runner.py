@@ -210,17 +210,10 @@ def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manife
         counts = ", ".join(f"{n} {why}" for why, n in sorted(manifest.rejected.items()))
         reason = f"{work.nothing}: {counts}" if counts else "the day has no frames"
     return _outcome(
-        stage,
-        task,
-        status,
-        manifest.work_key,
-        rows=manifest.rows,
-        kept=dict(manifest.kept),
-        rejected=dict(manifest.rejected),
-        reason=reason,
-        faults=tuple(manifest.extra.get(STATED_FAULTS, ())),
+        stage, task, status, manifest.work_key, rows=manifest.rows, kept=dict(manifest.kept),
+        rejected=dict(manifest.rejected), reason=reason, faults=tuple(manifest.extra.get(STATED_FAULTS, ())),
         outputs=[str(task.lake.folder(manifest.table, task.partition))],
-    )
+    )  # fmt: skip
 
 
 def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
@@ -258,18 +251,10 @@ def _record_outcome(stage: Stage, task: Task, work: Work, status: str, key: str,
     own = stage.writes[0].rows_among(rows)
     told = work.tell(own)
     return _outcome(
-        stage,
-        task,
-        "refused" if told.refused and status == "done" else status,
-        key,
-        rows=len(own),
-        kept=told.kept,
-        rejected=told.rejected,
-        reason=told.reason,
-        faults=told.faults,
-        outputs=[task.lake.table(t.name) for t in stage.writes if t.rows_among(rows)],
-        records=tuple(rows),
-    )
+        stage, task, "refused" if told.refused and status == "done" else status, key, rows=len(own),
+        kept=told.kept, rejected=told.rejected, reason=told.reason, faults=told.faults,
+        outputs=[task.lake.table(t.name) for t in stage.writes if t.rows_among(rows)], records=tuple(rows),
+    )  # fmt: skip
 
 
 def _outcome(stage: Stage, task: Task, status: str, key: str, **told: Any) -> Outcome:

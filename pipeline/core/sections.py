@@ -11,20 +11,9 @@ from pipeline.core.rigs import Positive, Section
 from schemas.calibrations import METHODS
 
 __all__ = [
-    "TERMS",
-    "AuditConfig",
-    "ChecksConfig",
-    "IngestConfig",
-    "LearnConfig",
-    "PerceiveConfig",
-    "PrepareConfig",
-    "ReportConfig",
-    "SearchRange",
-    "SelectConfig",
-    "SolveConfig",
-    "TriggerConfig",
-    "VerifyConfig",
-]
+    "TERMS", "AuditConfig", "ChecksConfig", "IngestConfig", "LearnConfig", "PerceiveConfig", "PrepareConfig",
+    "ReportConfig", "SearchRange", "SelectConfig", "SolveConfig", "TriggerConfig", "VerifyConfig",
+]  # fmt: skip
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Term = Literal[

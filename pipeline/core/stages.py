@@ -30,13 +30,7 @@ CALIBRATE = Stage(
     "pipeline.calibrate.stage:work",
     needs_inputs=False,
 )
-AUDIT = Stage(
-    "audit",
-    (CALIBRATIONS,),
-    (DRIFT,),
-    "pipeline.audit.stage:work",
-    per_vehicle_day=False,
-)
+AUDIT = Stage("audit", (CALIBRATIONS,), (DRIFT,), "pipeline.audit.stage:work", per_vehicle_day=False)
 STATE = Stage(
     "state",
     (CALIBRATIONS, POSES, DRIFT),

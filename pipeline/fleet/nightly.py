@@ -34,15 +34,7 @@ from schemas.calibrations import ASKS_FOR_FRAMES, CalibrationRecord
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 from schemas.words import day_word
 
-__all__ = [
-    "DayOutcome",
-    "DayPlan",
-    "Night",
-    "asks_for_more",
-    "plan_night",
-    "refused_at_once",
-    "run_night",
-]
+__all__ = ["DayOutcome", "DayPlan", "Night", "asks_for_more", "plan_night", "refused_at_once", "run_night"]
 
 
 @dataclass(frozen=True)
@@ -194,17 +186,10 @@ def _sum(a: Effort | None, b: Effort) -> Effort:
 def _task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:
     """Task of a vehicle-day for the stages; the caller commits the records."""
     return Task(
-        night.fleet,
-        night.lake,
-        work.partition,
-        night.method,
-        night.seed,
-        logs=tuple(work.logs),
-        progress=progress,
-        commit=False,
-        recorded=tuple(r for r in known.records if r.method == night.method),
+        night.fleet, night.lake, work.partition, night.method, night.seed, logs=tuple(work.logs),
+        progress=progress, commit=False, recorded=tuple(r for r in known.records if r.method == night.method),
         before=known.outcomes,
-    )
+    )  # fmt: skip
 
 
 def _through_stages(task: Task, progress: Progress) -> DayOutcome:

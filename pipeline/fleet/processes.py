@@ -21,16 +21,7 @@ from typing import Any, Generic, TypeVar
 from pipeline.core.memory import MODEL_THREADS, usable_cpus
 from pipeline.core.results import Progress
 
-__all__ = [
-    "ONE_THREAD",
-    "Board",
-    "Executor",
-    "Finished",
-    "Turns",
-    "Watch",
-    "attempt",
-    "run_processes",
-]
+__all__ = ["ONE_THREAD", "Board", "Executor", "Finished", "Turns", "Watch", "attempt", "run_processes"]
 
 # --------------------------------------------------------------------------------------------------
 # One function on many items: the executor interface, the result of an item, and retries.
@@ -162,13 +153,9 @@ def run_processes(
 
 
 def _drain(
-    pool: ProcessPoolExecutor,
-    items: Sequence[Item],
-    queue: deque[int],
-    workers: int,
-    board: Board,
+    pool: ProcessPoolExecutor, items: Sequence[Item], queue: deque[int], workers: int, board: Board,
     watch: Watch,
-) -> Generator[Finished[Item, Outcome], None, list[int]]:
+) -> Generator[Finished[Item, Outcome], None, list[int]]:  # fmt: skip
     """Run the queue until it is empty or the pool breaks; returns the items in work when it broke."""
     running: dict[Future[Finished[Item, Outcome]], int] = {}
     while queue or running:

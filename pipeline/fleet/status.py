@@ -96,19 +96,11 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
     else:
         status, reason, stage = _status(said), said.reason, said.stage
     return DayStatus(
-        vehicle,
-        day,
-        method,
-        status,
-        stage,
-        reason,
-        {} if last is None else {k: n for k, n in last.kept.items() if n},
-        max(r.asserted_at for r in own),
-        sum(r.seconds for r in own),
-        _total([r.bytes_read for r in own]),
-        _total([r.bytes_written for r in own]),
-        [] if said is None else list(said.faults),
-    )
+        vehicle, day, method, status, stage, reason,
+        {} if last is None else {k: n for k, n in last.kept.items() if n}, max(r.asserted_at for r in own),
+        sum(r.seconds for r in own), _total([r.bytes_read for r in own]),
+        _total([r.bytes_written for r in own]), [] if said is None else list(said.faults),
+    )  # fmt: skip
 
 
 def _status(row: OutcomeRow) -> str:

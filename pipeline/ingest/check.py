@@ -125,20 +125,14 @@ def check_logs(
     verdicts = [v for own in sample.verdicts.values() for v in own]
     first = sample.frames({str(kind): sensor for sensor, kind in reversed(index.kinds.items())})
     return CheckReport(
-        answer=overall(verdicts) if verdicts else "no",
-        verdicts=verdicts,
-        rig=sample.finding,
-        evidence=sample.whole,
-        topics=topics,
-        sync=_sync(index, len(anchored), fleet.ingest),
-        frame_ids=builder.prior.frame_ids,
-        has_point_time=any(f.lidar_time_s is not None for f in first),
+        answer=overall(verdicts) if verdicts else "no", verdicts=verdicts, rig=sample.finding,
+        evidence=sample.whole, topics=topics, sync=_sync(index, len(anchored), fleet.ingest),
+        frame_ids=builder.prior.frame_ids, has_point_time=any(f.lidar_time_s is not None for f in first),
         has_odometry=any(f.ego_speed_mps is not None for f in first),
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
-        problems=index.problems,
-        advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames)],
+        problems=index.problems, advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames)],
         corrections=_corrections(unheard, sample, index.problems, {p.name for p in logs}),
-    )
+    )  # fmt: skip
 
 
 def _corrections(

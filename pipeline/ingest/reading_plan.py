@@ -26,15 +26,9 @@ from pipeline.ingest.roles import IMAGE, INFO, LIDAR, ODOMETRY, RADAR, TF_STATIC
 from pipeline.rig.rig import Rig
 
 __all__ = [
-    "BURST_TRIOS",
-    "BurstMotion",
-    "Reading",
-    "choose_bursts",
-    "plan_reading",
-    "plan_sweeps",
-    "possible_bursts",
-    "rare_topics",
-]
+    "BURST_TRIOS", "BurstMotion", "Reading", "choose_bursts", "plan_reading", "plan_sweeps",
+    "possible_bursts", "rare_topics",
+]  # fmt: skip
 
 _GLANCE_NS = 250_000_000  # on each side: odometry comes at 10 Hz or more, and a chunk often holds a second
 _ANCHORS = (LIDAR, RADAR, IMAGE)  # messages that define moments, the first that a rig has

@@ -14,17 +14,9 @@ from jaxtyping import Bool, Int, Int64
 from schemas.moments import SAME_SCENE_NS
 
 __all__ = [
-    "WRONG_UNIT",
-    "Matched",
-    "Rejection",
-    "constant_gap_ns",
-    "first_occurrences",
-    "match_moments",
-    "match_nearest",
-    "nearest_gaps_ns",
-    "none_near",
-    "number_drives",
-]
+    "WRONG_UNIT", "Matched", "Rejection", "constant_gap_ns", "first_occurrences", "match_moments",
+    "match_nearest", "nearest_gaps_ns", "none_near", "number_drives",
+]  # fmt: skip
 
 _DRIVE_GAP_NS = 10 * 10**9
 _HALF_A_PERIOD = 0.55  # half a period, and a tenth of it for jitter

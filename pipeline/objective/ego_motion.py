@@ -24,18 +24,9 @@ from jaxtyping import Bool, Float
 from schemas.observations import Observation
 
 __all__ = [
-    "DopplerMotion",
-    "EgoMotion",
-    "Odometry",
-    "agreed_share",
-    "backwards",
-    "contradicting",
-    "ego_motion",
-    "is_same",
-    "mean_heading",
-    "motion_of",
-    "shown_heading",
-]
+    "DopplerMotion", "EgoMotion", "Odometry", "agreed_share", "backwards", "contradicting", "ego_motion",
+    "is_same", "mean_heading", "motion_of", "shown_heading",
+]  # fmt: skip
 
 # Speeds are the same within these. On 10 good days of seven rigs, the real car's too, odometry and lidar agreed in 89 %
 # of what moves and more, Doppler and lidar in 88 % (without odometry 69, and 48 for a 16-row rig whose Doppler is
@@ -125,10 +116,7 @@ def motion_of(
 
 
 def ego_motion(
-    radars: Sequence[DopplerMotion],
-    odometry: Odometry,
-    *,
-    heading: tuple[float, float] | None = None,
+    radars: Sequence[DopplerMotion], odometry: Odometry, *, heading: tuple[float, float] | None = None
 ) -> EgoMotion:
     """Fuse the motion by radars and odometry.
 

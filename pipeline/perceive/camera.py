@@ -18,19 +18,9 @@ from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_citysca
 from schemas.captures import ImageColumns
 
 __all__ = [
-    "BatchedSource",
-    "CameraSemantics",
-    "Detections",
-    "FrameReason",
-    "FrameRejectedError",
-    "SemanticsSource",
-    "TopicSource",
-    "decode_colour",
-    "decode_grey",
-    "encode_png",
-    "label_size",
-    "resize_labels",
-]
+    "BatchedSource", "CameraSemantics", "Detections", "FrameReason", "FrameRejectedError", "SemanticsSource",
+    "TopicSource", "decode_colour", "decode_grey", "encode_png", "label_size", "resize_labels",
+]  # fmt: skip
 
 _FLAT_PNG = (
     cv2.IMWRITE_PNG_COMPRESSION, 1,

@@ -141,15 +141,9 @@ def _united(
 @no_type_check
 @numba.njit(cache=True)
 def _join(
-    p: np.ndarray,
-    i: int,
-    begin: int,
-    end: int,
-    witness: int,
-    eps2: float,
-    core: np.ndarray,
+    p: np.ndarray, i: int, begin: int, end: int, witness: int, eps2: float, core: np.ndarray,
     parent: np.ndarray,
-) -> bool:
+) -> bool:  # fmt: skip
     """Unite a core point with those in reach in a cell; False if `witness`, united with all, is united with it."""
     own = _root(parent, i)
     # Most cells are united with this point already: that costs no look at their points.
@@ -185,14 +179,9 @@ def _common_core(begin: int, end: int, core: np.ndarray, parent: np.ndarray) -> 
 @no_type_check
 @numba.njit(cache=True)
 def _nearest_core(
-    p: np.ndarray,
-    i: int,
-    start: np.ndarray,
-    first: np.ndarray,
-    last: np.ndarray,
-    eps2: float,
+    p: np.ndarray, i: int, start: np.ndarray, first: np.ndarray, last: np.ndarray, eps2: float,
     core: np.ndarray,
-) -> int:
+) -> int:  # fmt: skip
     nearest, best = -1, eps2
     for r in range(9):
         for j in range(start[first[r]], start[last[r]]):

@@ -70,15 +70,10 @@ class RadarMotion:
 
 
 def radar_motion(
-    xyz_m: Float32[np.ndarray, "M 3"],
-    range_rate_mps: Float32[np.ndarray, " M"],
-    power_db: Float32[np.ndarray, " M"] | None,
-    period_mps: float | None,
-    travel: Travel,
-    has_elevation: bool,
-    config: PerceiveConfig,
-    rng: np.random.Generator,
-) -> RadarMotion:
+    xyz_m: Float32[np.ndarray, "M 3"], range_rate_mps: Float32[np.ndarray, " M"],
+    power_db: Float32[np.ndarray, " M"] | None, period_mps: float | None, travel: Travel, has_elevation: bool,
+    config: PerceiveConfig, rng: np.random.Generator,
+) -> RadarMotion:  # fmt: skip
     """Fit the radar's own velocity, separate static from moving detections and cluster the moving ones.
 
     Args:

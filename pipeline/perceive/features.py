@@ -31,14 +31,9 @@ from schemas.moments import Moment
 from schemas.observations import STEP_BELOW, STEP_RIGHT
 
 __all__ = [
-    "brightness_steps",
-    "deskewed",
-    "perceive_image",
-    "perceive_scan",
-    "perceive_sweep",
-    "speed_of",
+    "brightness_steps", "deskewed", "perceive_image", "perceive_scan", "perceive_sweep", "speed_of",
     "why_unusable",
-]
+]  # fmt: skip
 
 _MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
 _CAMERA = ("image_width_px", "image_height_px", "camera_model", "camera_K", "camera_D")
@@ -175,23 +170,14 @@ def perceive_scan(
         )
     )  # fmt: skip
     features = ScanFeatures(
-        **_begin(scan),
-        radar_xyz_m=xyz,
-        radar_power_db=scan.radar_power_db,
-        radar_residual_mps=motion.residual_mps,
-        radar_motion=motion.motion,
-        radar_cluster=motion.cluster,
-        radar_has_elevation=scan.radar_has_elevation,
-        radar_velocity_mps=motion.velocity_mps,
-        radar_velocity_cov=motion.velocity_cov,
-        radar_track_xyz_m=found.xyz_m,
-        radar_track_velocity_mps=found.velocity_mps,
-        radar_track_id=found.identity,
-        radar_track_age=found.age,
-        radar_track_points=found.points,
-        radar_drivable_azimuth_rad=sector.azimuth_rad,
+        **_begin(scan), radar_xyz_m=xyz, radar_power_db=scan.radar_power_db,
+        radar_residual_mps=motion.residual_mps, radar_motion=motion.motion, radar_cluster=motion.cluster,
+        radar_has_elevation=scan.radar_has_elevation, radar_velocity_mps=motion.velocity_mps,
+        radar_velocity_cov=motion.velocity_cov, radar_track_xyz_m=found.xyz_m,
+        radar_track_velocity_mps=found.velocity_mps, radar_track_id=found.identity, radar_track_age=found.age,
+        radar_track_points=found.points, radar_drivable_azimuth_rad=sector.azimuth_rad,
         radar_drivable_range_m=sector.range_m,
-    )
+    )  # fmt: skip
     return features, state
 
 

@@ -24,21 +24,9 @@ from jaxtyping import Float32, UInt8
 from pipeline.core.rigs import RoadUser, StreetClass
 
 __all__ = [
-    "BINS",
-    "CITYSCAPES",
-    "DETECTOR_COUNTS",
-    "DETECTOR_SETS",
-    "LABEL_COUNTS",
-    "LABEL_SETS",
-    "REACH_PX",
-    "ROAD_ID",
-    "ROAD_USERS",
-    "SKY_ID",
-    "VOID_ID",
-    "label_gradients",
-    "road_user_name",
-    "to_cityscapes",
-]
+    "BINS", "CITYSCAPES", "DETECTOR_COUNTS", "DETECTOR_SETS", "LABEL_COUNTS", "LABEL_SETS", "REACH_PX",
+    "ROAD_ID", "ROAD_USERS", "SKY_ID", "VOID_ID", "label_gradients", "road_user_name", "to_cityscapes",
+]  # fmt: skip
 
 CITYSCAPES: tuple[str, ...] = get_args(StreetClass)  # the place is the train id
 ROAD_USERS: tuple[str, ...] = get_args(RoadUser)

@@ -98,13 +98,9 @@ def measure_clusters(
 
 
 def advance_tracks(
-    state: TrackState,
-    stamp_ns: int,
-    drive: int,
-    ego: EgoMotion,
-    returns: ClusterReturns,
+    state: TrackState, stamp_ns: int, drive: int, ego: EgoMotion, returns: ClusterReturns,
     period_mps: float | None,
-) -> tuple[TrackState, Tracks]:
+) -> tuple[TrackState, Tracks]:  # fmt: skip
     """Predict all tracks to `stamp_ns`, match the scan's clusters to them, start tracks for the others.
 
     A new drive, a gap above 2.5 s or an unknown ego velocity deletes all tracks, because nothing links the

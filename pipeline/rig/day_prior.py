@@ -23,15 +23,9 @@ from schemas.calibrations import FRAMES_OF_PAIR, SENSORS, pairs_of
 from schemas.observations import Observation
 
 __all__ = [
-    "no_prior",
-    "prior_key",
-    "prior_of_three",
-    "read_prior",
-    "read_star",
-    "read_transforms",
-    "require_named_files",
-    "rig_prior",
-]
+    "no_prior", "prior_key", "prior_of_three", "read_prior", "read_star", "read_transforms",
+    "require_named_files", "rig_prior",
+]  # fmt: skip
 
 _KEYS = {"T_camera_lidar", "T_lidar_radar", "T_radar_lidar", "T_camera_radar"}
 _SAME = 1e-6  # rad and m: tolerance for written numbers, which have no noise

@@ -14,22 +14,9 @@ from pipeline.rig.se3 import adjoint, change_between
 from schemas.faults import FAULTS
 
 __all__ = [
-    "EDGE",
-    "HARMLESS",
-    "Change",
-    "Check",
-    "DayParts",
-    "EdgeEvidence",
-    "OtherScenes",
-    "PairEstimate",
-    "Prior",
-    "Solution",
-    "change_of",
-    "common_of",
-    "common_part",
-    "faults_of",
-    "prior_share",
-]
+    "EDGE", "HARMLESS", "Change", "Check", "DayParts", "EdgeEvidence", "OtherScenes", "PairEstimate", "Prior",
+    "Solution", "change_of", "common_of", "common_part", "faults_of", "prior_share",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

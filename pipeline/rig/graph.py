@@ -25,28 +25,10 @@ from schemas.drift import DriftFinding
 from schemas.states import StateRow
 
 __all__ = [
-    "BASE",
-    "EDGE_KINDS",
-    "EDGE_OF_PAIR",
-    "KINDS",
-    "POSE",
-    "TIE_KINDS",
-    "Edge",
-    "Kind",
-    "RigGraph",
-    "Sensor",
-    "edge_between",
-    "edge_named",
-    "edge_of",
-    "edge_order",
-    "edges_of_rows",
-    "is_one_of_each",
-    "pose_columns",
-    "pose_of",
-    "possible_edges",
-    "tie",
-    "words_of",
-]
+    "BASE", "EDGE_KINDS", "EDGE_OF_PAIR", "KINDS", "POSE", "TIE_KINDS", "Edge", "Kind", "RigGraph", "Sensor",
+    "edge_between", "edge_named", "edge_of", "edge_order", "edges_of_rows", "is_one_of_each", "pose_columns",
+    "pose_of", "possible_edges", "tie", "words_of",
+]  # fmt: skip
 
 Kind = Literal["camera", "lidar", "radar", "base"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)

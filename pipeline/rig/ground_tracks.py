@@ -93,13 +93,9 @@ def carried(
 
 
 def advance(
-    filters: Filters,
-    measured: Measurements,
-    born: Callable[[Measurements, np.ndarray, int], Filters],
-    first_identity: int,
-    gate: float,
-    missed_s: float,
-) -> tuple[Filters, Int[np.ndarray, " K"]]:
+    filters: Filters, measured: Measurements, born: Callable[[Measurements, np.ndarray, int], Filters],
+    first_identity: int, gate: float, missed_s: float,
+) -> tuple[Filters, Int[np.ndarray, " K"]]:  # fmt: skip
     """Assign measurements to filters predicted to the scan; `born` makes filters from the unassigned ones.
 
     New identities start at `first_identity`. A match is within `gate` (squared distance in sigmas); an object

@@ -19,15 +19,9 @@ from pipeline.rig.prior import RigPrior
 from pipeline.rig.se3 import exp_so3, inverse, to_spherical, transform_points
 
 __all__ = [
-    "FRAMES",
-    "Overlap",
-    "View",
-    "best_three",
-    "find_edges",
-    "overlaps_of",
-    "view_of_camera",
+    "FRAMES", "Overlap", "View", "best_three", "find_edges", "overlaps_of", "view_of_camera",
     "view_of_clouds",
-]
+]  # fmt: skip
 
 _RANGES_M = (15.0, 25.0, 40.0)  # target ranges at which pairs are certified
 _LEAST = 0.05  # minimum overlap, as share of the smaller view

@@ -26,18 +26,9 @@ from pipeline.rig.se3 import (
 )
 
 __all__ = [
-    "Extrinsics",
-    "RigPrior",
-    "Star",
-    "agreed",
-    "between",
-    "from_rows",
-    "middle_of",
-    "moved",
-    "star_of",
-    "to_rows",
-    "transform_of_row",
-]
+    "Extrinsics", "RigPrior", "Star", "agreed", "between", "from_rows", "middle_of", "moved", "star_of",
+    "to_rows", "transform_of_row",
+]  # fmt: skip
 
 Star = Mapping[tuple[str, str], np.ndarray]  # T_parent_child 4 4 by (parent, child)
 

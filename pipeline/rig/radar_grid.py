@@ -16,17 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 __all__ = [
-    "CHANNELS",
-    "RANGE_STEP_M",
-    "SHAPE",
-    "Scan",
-    "ScanMemory",
-    "cell_centres",
-    "grid_layout",
-    "scan_features",
-    "sector_mask",
-    "sector_of",
-]
+    "CHANNELS", "RANGE_STEP_M", "SHAPE", "Scan", "ScanMemory", "cell_centres", "grid_layout", "scan_features",
+    "sector_mask", "sector_of",
+]  # fmt: skip
 
 CHANNELS = ("static", "moving", "undecided", "power", "residual", "recent_static", "static_until", "range")
 SHAPE = (70, 60)  # azimuths, ranges: the extent of the geometric free sector

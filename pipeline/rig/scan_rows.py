@@ -196,15 +196,9 @@ def channels_of(
 
 
 def vote_of_neighbours(
-    image: RangeImage,
-    labels: Int[np.ndarray, "H W"],
-    classes: int,
-    *,
-    neighbours: int,
-    search: int,
-    sigma_px: float,
-    cutoff_m: float,
-) -> Int[np.ndarray, " N"]:
+    image: RangeImage, labels: Int[np.ndarray, "H W"], classes: int, *, neighbours: int, search: int,
+    sigma_px: float, cutoff_m: float,
+) -> Int[np.ndarray, " N"]:  # fmt: skip
     """Labels of all points, by vote of the surrounding pixels closest in range.
 
     A hidden point has the label of the drawn point in its own pixel, but its neighbours in range outvote it.

@@ -19,30 +19,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
 __all__ = [
-    "adjoint",
-    "camera_direction_angles",
-    "change_between",
-    "change_covariance",
-    "change_jacobian",
-    "changed",
-    "compose_covariance",
-    "exp_se3",
-    "exp_so3",
-    "from_quaternion",
-    "from_rotation_translation",
-    "from_spherical",
-    "hat",
-    "inverse",
-    "log_se3",
-    "log_so3",
-    "perturb_exactly",
-    "rotation_angle_rad",
-    "spherical_jacobian",
-    "to_quaternion",
-    "to_spherical",
-    "transform_points",
-    "wrap_angle",
-]
+    "adjoint", "camera_direction_angles", "change_between", "change_covariance", "change_jacobian", "changed",
+    "compose_covariance", "exp_se3", "exp_so3", "from_quaternion", "from_rotation_translation",
+    "from_spherical", "hat", "inverse", "log_se3", "log_so3", "perturb_exactly", "rotation_angle_rad",
+    "spherical_jacobian", "to_quaternion", "to_spherical", "transform_points", "wrap_angle",
+]  # fmt: skip
 
 
 def hat(omega: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:

@@ -33,16 +33,9 @@ from pipeline.simulate.sensors.rigs import RIGS
 from pipeline.simulate.sensors.semantics import SemanticsSpec
 
 __all__ = [
-    "KINDS",
-    "DayFaults",
-    "Fault",
-    "faults_on",
-    "misread",
-    "networks_on",
-    "parse_faults",
-    "shaken",
+    "KINDS", "DayFaults", "Fault", "faults_on", "misread", "networks_on", "parse_faults", "shaken",
     "swapped_with",
-]
+]  # fmt: skip
 
 _AXES: Final = {"roll": 0, "pitch": 1, "yaw": 2, "x": 0, "y": 1, "z": 2}
 _CAMERA_ONLY: Final = ("intrinsics", "centre", "centre-v", "labels", "night", "dusk", "few")
@@ -50,12 +43,7 @@ _SENT: Final = ("missing", "stuck")
 _DAY_ONLY: Final = (*_SENT, "swap", *_CAMERA_ONLY)
 _CLOCKS: Final = ("time", "stamp")
 _WARM: Final = "warm-"
-KINDS: Final = (
-    *_AXES,
-    *(f"{how}-{a}" for how in ("drift", "warm") for a in _AXES),
-    *_CLOCKS,
-    *_DAY_ONLY,
-)
+KINDS: Final = (*_AXES, *(f"{how}-{a}" for how in ("drift", "warm") for a in _AXES), *_CLOCKS, *_DAY_ONLY)
 
 
 @dataclass(frozen=True)
@@ -187,10 +175,6 @@ def networks_on(today: DayFaults) -> SemanticsSpec:
     if not today.has("night"):
         return spec
     return replace(
-        spec,
-        boundary_px=3 * spec.boundary_px,
-        confusion=0.35,
-        miss=0.5,
-        box_jitter=3 * spec.box_jitter,
+        spec, boundary_px=3 * spec.boundary_px, confusion=0.35, miss=0.5, box_jitter=3 * spec.box_jitter,
         false_boxes=3 * spec.false_boxes,
-    )
+    )  # fmt: skip

@@ -33,16 +33,9 @@ from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import landscape_named
 
 __all__ = [
-    "FleetSpec",
-    "begin_fleet",
-    "day_names",
-    "drive_of",
-    "fleet_toml",
-    "mounting_on",
-    "remove_half_logs",
-    "simulate_fleet",
-    "simulate_vehicle_day",
-]
+    "FleetSpec", "begin_fleet", "day_names", "drive_of", "fleet_toml", "mounting_on", "remove_half_logs",
+    "simulate_fleet", "simulate_vehicle_day",
+]  # fmt: skip
 
 _IN_TURN: Final = "mixed"
 

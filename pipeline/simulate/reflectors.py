@@ -145,13 +145,9 @@ def _picks(setup: Setup, scans: list[Scan], rng: np.random.Generator) -> dict[st
 
 
 def _target(
-    scans: list[Scan],
-    pixel: Float[np.ndarray, " 2"],
-    lidar_m: Float[np.ndarray, " 3"],
-    radar_m: Float[np.ndarray, " 3"],
-    width_px: int,
-    rng: np.random.Generator,
-) -> dict[str, Any]:
+    scans: list[Scan], pixel: Float[np.ndarray, " 2"], lidar_m: Float[np.ndarray, " 3"],
+    radar_m: Float[np.ndarray, " 3"], width_px: int, rng: np.random.Generator,
+) -> dict[str, Any]:  # fmt: skip
     """One reflector as picked, from its true position in each sensor."""
     step = width_px / 1824  # half a pixel of the full camera
     pixel_sd, lidar_sd = 0.5 * max(step, 0.5), _LIDAR_PICK_SIGMA_M

@@ -22,17 +22,9 @@ from schemas.states import STATES, StateRow
 from schemas.words import AXIS_NAMES, axes_in_words
 
 __all__ = [
-    "current_drift",
-    "current_events",
-    "current_poses",
-    "current_records",
-    "current_rows",
-    "current_states",
-    "prior_of",
-    "state_values",
-    "targets_of",
-    "transform_of",
-]
+    "current_drift", "current_events", "current_poses", "current_records", "current_rows", "current_states",
+    "prior_of", "state_values", "targets_of", "transform_of",
+]  # fmt: skip
 
 _Row = TypeVar("_Row")
 _Said = TypeVar("_Said", DriftFinding, StateRow)
@@ -107,9 +99,7 @@ def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
     return [event for event in noted.values() if not event.withdrawn]
 
 
-def transform_of(
-    record: CalibrationRecord | StateRow | PoseRow,
-) -> Float[np.ndarray, "4 4"] | None:
+def transform_of(record: CalibrationRecord | StateRow | PoseRow) -> Float[np.ndarray, "4 4"] | None:
     """T_parent_child of a record or state, T_reference_sensor of a pose; None without an estimate."""
     return pose_of(partial(getattr, record))
 

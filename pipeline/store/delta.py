@@ -29,21 +29,9 @@ from schemas.columns import TableSchema
 from schemas.versions import CODE_VERSION
 
 __all__ = [
-    "DAMAGED",
-    "LOG",
-    "LiveFile",
-    "Wanted",
-    "create_table",
-    "live_files",
-    "merge_rows",
-    "open_table",
-    "read_file",
-    "set_aside",
-    "set_aside_damaged",
-    "spans_of_file",
-    "tidy_table",
-    "with_months",
-]
+    "DAMAGED", "LOG", "LiveFile", "Wanted", "create_table", "live_files", "merge_rows", "open_table",
+    "read_file", "set_aside", "set_aside_damaged", "spans_of_file", "tidy_table", "with_months",
+]  # fmt: skip
 
 _MONTH = "month"
 _VERSION, _RELEASE = "boresight.version", "boresight.release"
@@ -287,11 +275,7 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
     # Without descriptions: those of another release may be worded otherwise, and could not be merged.
     rows = rows.cast(pa.schema([f.remove_metadata() for f in rows.schema]))
     merging = table.merge(
-        rows,
-        f"{window} and {same}",
-        source_alias="s",
-        target_alias="t",
-        writer_properties=_WRITER,
+        rows, f"{window} and {same}", source_alias="s", target_alias="t", writer_properties=_WRITER
     ).when_matched_update({"asserted_at": "s.asserted_at"}, predicate="s.asserted_at > t.asserted_at")
     (merging.when_not_matched_insert_all() if insert else merging).execute()
 

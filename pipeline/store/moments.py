@@ -75,11 +75,7 @@ class MomentWriter:
 
 @contextmanager
 def write_moments(
-    lake: Lake,
-    schema: TableSchema,
-    partition: Partition,
-    work_key: str,
-    inputs: Iterable[str] = (),
+    lake: Lake, schema: TableSchema, partition: Partition, work_key: str, inputs: Iterable[str] = ()
 ) -> Iterator[MomentWriter]:
     """Replace the moments of a vehicle-day and the files of its sensors; on an error the old ones stay.
 

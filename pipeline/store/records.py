@@ -26,19 +26,9 @@ from pipeline.store.rows import from_table
 from schemas.columns import TableSchema
 
 __all__ = [
-    "Assertion",
-    "RecordIndex",
-    "files_there",
-    "first_day",
-    "last_assertion",
-    "last_day",
-    "once",
-    "read_columns",
-    "read_last",
-    "read_last_columns",
-    "read_latest",
-    "read_records",
-]
+    "Assertion", "RecordIndex", "files_there", "first_day", "last_assertion", "last_day", "once",
+    "read_columns", "read_last", "read_last_columns", "read_latest", "read_records",
+]  # fmt: skip
 
 Row = TypeVar("Row")
 # Clock difference of machines that write a table: a file is at most this much older than its rows.
@@ -54,16 +44,10 @@ class Assertion(NamedTuple):
 
 
 def read_records(
-    lake: Lake,
-    schema: TableSchema,
-    row_type: type[Row],
-    *,
-    vehicle: str | AbstractSet[str] | None = None,
-    day: str | None = None,
-    first: str | None = None,
-    last: str | None = None,
+    lake: Lake, schema: TableSchema, row_type: type[Row], *, vehicle: str | AbstractSet[str] | None = None,
+    day: str | None = None, first: str | None = None, last: str | None = None,
     columns: Sequence[str] | None = None,
-) -> list[Row]:
+) -> list[Row]:  # fmt: skip
     """Records in order of vehicle, day and last assertion; `current_records` keeps the last of a key.
 
     Damaged or missing files are left out and listed in `lake.damage`.
@@ -81,15 +65,9 @@ def read_records(
 
 
 def read_columns(
-    lake: Lake,
-    schema: TableSchema,
-    columns: Sequence[str],
-    *,
-    first: str | None,
-    last: str | None,
-    vehicle: str | AbstractSet[str] | None = None,
-    asserted_after: str | None = None,
-) -> pa.Table | None:
+    lake: Lake, schema: TableSchema, columns: Sequence[str], *, first: str | None, last: str | None,
+    vehicle: str | AbstractSet[str] | None = None, asserted_after: str | None = None,
+) -> pa.Table | None:  # fmt: skip
     """Columns of the records of a window of days, unordered, plus those that `current_rows` needs; else None.
 
     For thousands of vehicles, whose records would be gigabytes as rows.
@@ -111,14 +89,9 @@ class RecordIndex(Generic[Row]):
     """
 
     def __init__(
-        self,
-        lake: Lake,
-        schema: TableSchema,
-        row_type: type[Row],
-        first: str,
-        last: str,
+        self, lake: Lake, schema: TableSchema, row_type: type[Row], first: str, last: str,
         columns: Sequence[str] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._schema, self._row_type = schema, row_type
         self._rows = _sorted_rows(lake, schema, row_type, Wanted(None, first, last), columns)
         self._spans: dict[tuple[str, str], tuple[int, int]] = {}
@@ -136,11 +109,7 @@ class RecordIndex(Generic[Row]):
 
 
 def _sorted_rows(
-    lake: Lake,
-    schema: TableSchema,
-    row_type: type[Any],
-    wanted: Wanted,
-    columns: Sequence[str] | None,
+    lake: Lake, schema: TableSchema, row_type: type[Any], wanted: Wanted, columns: Sequence[str] | None
 ) -> pa.Table | None:
     """Columns in the order of `read_records`; None if there is no row."""
     known = {f.name: f for f in fields(row_type)}
@@ -155,13 +124,7 @@ def _sorted_rows(
 
 
 def read_latest(
-    lake: Lake,
-    schema: TableSchema,
-    row_type: type[Row],
-    *,
-    first: str,
-    last: str,
-    columns: Sequence[str],
+    lake: Lake, schema: TableSchema, row_type: type[Row], *, first: str, last: str, columns: Sequence[str]
 ) -> list[Row]:
     """Records of the last recorded day of each vehicle and method, in the order of `read_records`.
 
@@ -199,14 +162,9 @@ def last_assertion(lake: Lake, schema: TableSchema, method: str | None = None) -
 
 
 def read_last(
-    lake: Lake,
-    schema: TableSchema,
-    row_type: type[Row],
-    method: str,
-    *,
-    vehicle: str | AbstractSet[str] | None = None,
-    columns: Sequence[str] | None = None,
-) -> list[Row]:
+    lake: Lake, schema: TableSchema, row_type: type[Row], method: str, *,
+    vehicle: str | AbstractSet[str] | None = None, columns: Sequence[str] | None = None,
+) -> list[Row]:  # fmt: skip
     """Rows that a stage of the whole fleet asserted last for a method, together, by `commit_last`."""
     last = last_assertion(lake, schema, method)
     if last is None:

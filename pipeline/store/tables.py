@@ -20,22 +20,10 @@ from schemas.columns import TableSchema
 from schemas.versions import CODE_VERSION
 
 __all__ = [
-    "COLLECTED",
-    "Manifest",
-    "PartitionWriter",
-    "RowGroup",
-    "absence",
-    "iterate_rows",
-    "naming_damage",
-    "opened_for_writing",
-    "read_columns",
-    "read_group",
-    "read_manifest",
-    "read_rows",
-    "row_groups",
-    "write_manifest",
-    "write_partition",
-]
+    "COLLECTED", "Manifest", "PartitionWriter", "RowGroup", "absence", "iterate_rows", "naming_damage",
+    "opened_for_writing", "read_columns", "read_group", "read_manifest", "read_rows", "row_groups",
+    "write_manifest", "write_partition",
+]  # fmt: skip
 
 Row = TypeVar("Row")
 _KEY = b"boresight"
@@ -130,11 +118,7 @@ def opened_for_writing(lake: Lake, path: PurePath, schema: TableSchema) -> Itera
 
 @contextmanager
 def write_partition(
-    lake: Lake,
-    schema: TableSchema,
-    partition: Partition,
-    work_key: str,
-    inputs: Iterable[str] = (),
+    lake: Lake, schema: TableSchema, partition: Partition, work_key: str, inputs: Iterable[str] = ()
 ) -> Iterator[PartitionWriter]:
     """Replace one partition as a whole, atomically; on an error the old file stays."""
     with opened_for_writing(lake, lake.file(schema.name, partition), schema) as writer:
@@ -183,13 +167,9 @@ def read_rows(lake: Lake, schema: TableSchema, partition: Partition, row_type: t
 
 
 def iterate_rows(
-    lake: Lake,
-    schema: TableSchema,
-    partition: Partition,
-    row_type: type[Row],
-    rows: Sequence[int] | None = None,
-    sensor: str | None = None,
-) -> Iterator[list[Row]]:
+    lake: Lake, schema: TableSchema, partition: Partition, row_type: type[Row],
+    rows: Sequence[int] | None = None, sensor: str | None = None,
+) -> Iterator[list[Row]]:  # fmt: skip
     """Rows of a partition, or of a sensor's file, one row group at a time; `rows` selects row numbers.
 
     Raises:

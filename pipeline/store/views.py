@@ -22,16 +22,9 @@ from schemas.moments import MOMENTS, PERCEIVED, PRIOR, EgoColumns, Moment
 from schemas.observations import Observation
 
 __all__ = [
-    "Chosen",
-    "frame_of",
-    "frames_of",
-    "ingested",
-    "logged_stars",
-    "observations_of",
-    "perceived",
-    "perceived_days",
-    "priors_of",
-]
+    "Chosen", "frame_of", "frames_of", "ingested", "logged_stars", "observations_of", "perceived",
+    "perceived_days", "priors_of",
+]  # fmt: skip
 
 Chosen = Mapping[str, str]  # names of the camera, lidar and radar of a view, by kind; some may be missing
 

@@ -35,19 +35,9 @@ from schemas.calibrations import PROBE_Z, CalibrationRecord
 from schemas.poses import PoseRow
 
 __all__ = [
-    "NOT_IN_USE",
-    "answer_of",
-    "answers_by_sensor",
-    "check_axes",
-    "check_pose",
-    "errors_in_words",
-    "held_out_of",
-    "kind_of_pose",
-    "limits_of",
-    "probes",
-    "shared_sigmas",
-    "wrong_sensors",
-]
+    "NOT_IN_USE", "answer_of", "answers_by_sensor", "check_axes", "check_pose", "errors_in_words",
+    "held_out_of", "kind_of_pose", "limits_of", "probes", "shared_sigmas", "wrong_sensors",
+]  # fmt: skip
 
 # False alarm once in 370 correct calibrations; rarer if the limit, which must be exceeded too, is larger than
 # that.
@@ -150,14 +140,10 @@ def check_pose(
 
 
 def _checks(
-    of: tuple[str, str, tuple[str, ...]],
-    pair: str,
-    in_use: Float[np.ndarray, "4 4"] | None,
-    of_log: tuple[np.ndarray | None, np.ndarray | None, np.ndarray, str],
-    limits: Mapping[str, AxisLimits],
-    beyond: float,
-    held_out: Mapping[str, HeldOut],
-) -> list[AxisCheck]:
+    of: tuple[str, str, tuple[str, ...]], pair: str, in_use: Float[np.ndarray, "4 4"] | None,
+    of_log: tuple[np.ndarray | None, np.ndarray | None, np.ndarray, str], limits: Mapping[str, AxisLimits],
+    beyond: float, held_out: Mapping[str, HeldOut],
+) -> list[AxisCheck]:  # fmt: skip
     """Checks by axis, from the log's estimate, its covariance and targets, and why it is not usable (or empty)."""
     found, covariance, targets, why = of_log
     off = dict.fromkeys(limits, (float("nan"), float("nan")))

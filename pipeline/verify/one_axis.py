@@ -114,14 +114,9 @@ def shown_from(limit_rad: float, sigma_rad: float, beyond: float, held_out: Held
 
 
 def checked(
-    of: tuple[str, str, tuple[str, ...]],
-    axis: str,
-    limits: AxisLimits,
-    off: tuple[float, float],
-    blocked: str,
-    beyond: float,
-    held_out: HeldOut | None = None,
-) -> AxisCheck:
+    of: tuple[str, str, tuple[str, ...]], axis: str, limits: AxisLimits, off: tuple[float, float],
+    blocked: str, beyond: float, held_out: HeldOut | None = None,
+) -> AxisCheck:  # fmt: skip
     """Check one axis.
 
     Args:

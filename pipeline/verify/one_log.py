@@ -84,13 +84,9 @@ def with_prior(config: FleetConfig, lake: Lake, vehicle: str, prior: RigPrior) -
 
 
 def check_poses(
-    rows: Iterable[PoseRow],
-    prior: RigPrior | None,
-    lacking: Sequence[Sensor],
-    verify: VerifyConfig,
-    asked_deg: tuple[float, float],
-    records: Sequence[CalibrationRecord] = (),
-) -> list[AxisCheck]:
+    rows: Iterable[PoseRow], prior: RigPrior | None, lacking: Sequence[Sensor], verify: VerifyConfig,
+    asked_deg: tuple[float, float], records: Sequence[CalibrationRecord] = (),
+) -> list[AxisCheck]:  # fmt: skip
     """Check every axis of every sensor except the reference.
 
     Args:

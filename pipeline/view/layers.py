@@ -25,21 +25,9 @@ from schemas.features import ImageFeatures, ScanFeatures, SweepFeatures
 from schemas.moments import MOMENTS, PERCEIVED, Moment, Perceived
 
 __all__ = [
-    "AXES",
-    "COLOURS",
-    "PARTS",
-    "STATES",
-    "Dots",
-    "Layer",
-    "Name",
-    "Picture",
-    "Rig",
-    "Shown",
-    "Strokes",
-    "count_moments",
-    "layers_of",
-    "read_moment",
-]
+    "AXES", "COLOURS", "PARTS", "STATES", "Dots", "Layer", "Name", "Picture", "Rig", "Shown", "Strokes",
+    "count_moments", "layers_of", "read_moment",
+]  # fmt: skip
 
 # What can be hidden, in the order of the window's boxes.
 PARTS = ("sweeps", "radar", "cameras", "boxes", "names")

@@ -31,14 +31,7 @@ from pipeline.rig.se3 import (
     log_se3,
 )
 
-__all__ = [
-    "Equations",
-    "LinearEdge",
-    "Rig",
-    "equations_at",
-    "evidence_of",
-    "left_jacobian_inverse",
-]
+__all__ = ["Equations", "LinearEdge", "Rig", "equations_at", "evidence_of", "left_jacobian_inverse"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,11 +222,7 @@ _LEAST_NOISE = 0.01
 
 
 def evidence_of(
-    estimate: PairEstimate,
-    edge: Edge,
-    prior: Prior,
-    clock_sigma_s: float,
-    checks: Sequence[Check] = (),
+    estimate: PairEstimate, edge: Edge, prior: Prior, clock_sigma_s: float, checks: Sequence[Check] = ()
 ) -> EdgeEvidence:
     """The estimate without its prior.
 
@@ -251,19 +240,11 @@ def evidence_of(
     if estimate.disproved:
         failed.append(Check(estimate.disproved, disproves=True))
     return EdgeEvidence(
-        edge,
-        estimate.T,
-        estimate.time_offset_s or 0.0,
-        0.5 * (information + information.T),
-        gradient,
-        _by_name(bias, edge, estimate.T),
-        estimate.frames_used,
-        estimate.frames_rejected,
-        tuple(dict.fromkeys(failed)),
-        estimate.diagnostics,
-        tuple(estimate.notes),
+        edge, estimate.T, estimate.time_offset_s or 0.0, 0.5 * (information + information.T), gradient,
+        _by_name(bias, edge, estimate.T), estimate.frames_used, estimate.frames_rejected,
+        tuple(dict.fromkeys(failed)), estimate.diagnostics, tuple(estimate.notes),
         parts=estimate.parts if estimate.observable.any() else None,
-    )
+    )  # fmt: skip
 
 
 def _of_pose(

@@ -76,14 +76,9 @@ _Found = tuple[PairEstimate, list[Check]]
 
 
 def solve_joint(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    config: SolveConfig,
-    *,
-    seed: int,
-    triggered: Sequence[str] = PAIRS,
-    progress: Progress = silent,
-) -> Solution:
+    observations: Mapping[str, Sequence[Observation]], prior: Prior, config: SolveConfig, *, seed: int,
+    triggered: Sequence[str] = PAIRS, progress: Progress = silent,
+) -> Solution:  # fmt: skip
     """Solve the pairs that have frames, if triggered; others keep the prior.
 
     A pair that the day cannot determine keeps its prior too, with a failed check that gives the reason.
@@ -105,13 +100,9 @@ def solve_joint(
 
 
 def _solved(
-    pair: str,
-    observations: Sequence[Observation],
-    prior: Prior,
-    config: SolveConfig,
-    seed: int,
+    pair: str, observations: Sequence[Observation], prior: Prior, config: SolveConfig, seed: int,
     before: Mapping[str, _Found],
-) -> _Found:
+) -> _Found:  # fmt: skip
     rng = np.random.default_rng([seed, ("camera_lidar", "lidar_radar", "camera_radar").index(pair)])
     if pair == "lidar_radar":
         return estimate_lidar_radar(observations, prior, config, rng), []
@@ -202,13 +193,9 @@ class _Equations:
 
 
 def estimate_camera_radar(
-    observations: Sequence[Observation],
-    prior: Prior,
-    config: SolveConfig,
-    rng: np.random.Generator,
-    *,
+    observations: Sequence[Observation], prior: Prior, config: SolveConfig, rng: np.random.Generator, *,
     boxes: bool = True,
-) -> PairEstimate:
+) -> PairEstimate:  # fmt: skip
     """Estimate the rotation of T_camera_radar from objects in view of both camera and radar, without the lidar.
 
     Args:

@@ -24,21 +24,10 @@ from scipy.special import ndtri, stdtrit
 from pipeline.rig.se3 import exp_se3
 
 __all__ = [
-    "CLEARLY",
-    "DESIGN",
-    "OBSERVABLE",
-    "Posterior",
-    "at_least",
-    "bootstrap_covariance",
-    "covariance_with_fixed",
-    "fit_quadratics",
-    "inverse_of_information",
-    "posterior",
-    "response",
-    "sandwich_covariance",
-    "spread_to_covariance",
-    "widening",
-]
+    "CLEARLY", "DESIGN", "OBSERVABLE", "Posterior", "at_least", "bootstrap_covariance",
+    "covariance_with_fixed", "fit_quadratics", "inverse_of_information", "posterior", "response",
+    "sandwich_covariance", "spread_to_covariance", "widening",
+]  # fmt: skip
 
 CLEARLY = 4.0  # standard errors by which frames reject the end of another start
 OBSERVABLE = 0.5  # the day at least halved the variance
@@ -55,14 +44,10 @@ class Posterior:
 
 
 def bootstrap_covariance(
-    information: Float[np.ndarray, "F P P"],
-    score: Float[np.ndarray, "F P"],
-    prior_information: Float[np.ndarray, "P P"],
-    block: Int64[np.ndarray, " F"],
-    rng: np.random.Generator,
-    resamples: int = 200,
-    degrees: float = 0.0,
-) -> Float[np.ndarray, "P P"]:
+    information: Float[np.ndarray, "F P P"], score: Float[np.ndarray, "F P"],
+    prior_information: Float[np.ndarray, "P P"], block: Int64[np.ndarray, " F"], rng: np.random.Generator,
+    resamples: int = 200, degrees: float = 0.0,
+) -> Float[np.ndarray, "P P"]:  # fmt: skip
     """Covariance of a MAP estimate by resampling blocks of frames.
 
     Args:
@@ -116,15 +101,11 @@ def response(
 
 
 def covariance_with_fixed(
-    information: Float[np.ndarray, "F P P"],
-    score: Float[np.ndarray, "F P"],
-    prior_variance: Float[np.ndarray, " P"],
-    curvature: Float[np.ndarray, "P P"],
-    fixed: Bool[np.ndarray, " P"],
-    block: Int64[np.ndarray, " F"],
-    rng: np.random.Generator,
+    information: Float[np.ndarray, "F P P"], score: Float[np.ndarray, "F P"],
+    prior_variance: Float[np.ndarray, " P"], curvature: Float[np.ndarray, "P P"],
+    fixed: Bool[np.ndarray, " P"], block: Int64[np.ndarray, " F"], rng: np.random.Generator,
     degrees: float = 0.0,
-) -> Float[np.ndarray, "P P"]:
+) -> Float[np.ndarray, "P P"]:  # fmt: skip
     """Covariance of a MAP estimate some of whose parameters were fixed at the prior.
 
     Args:
@@ -141,13 +122,9 @@ def covariance_with_fixed(
     out = np.zeros((len(fixed), len(fixed)))
     prior_information = np.diag(1 / prior_variance[~fixed])
     out[at] = bootstrap_covariance(
-        information[:, ~fixed][:, :, ~fixed],
-        score[:, ~fixed],
-        prior_information,
-        block,
-        rng,
+        information[:, ~fixed][:, :, ~fixed], score[:, ~fixed], prior_information, block, rng,
         degrees=degrees,
-    )
+    )  # fmt: skip
     along = response(curvature, fixed, np.zeros_like(fixed))
     return out + (along * prior_variance[fixed]) @ along.T
 

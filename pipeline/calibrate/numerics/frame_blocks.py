@@ -21,17 +21,9 @@ from pipeline.rig.estimates import DayParts, PairEstimate
 from schemas.observations import Observation
 
 __all__ = [
-    "FEWEST_SCENES",
-    "SCENE_DEGREES",
-    "Scenes",
-    "blocks_of",
-    "bootstrap_blocks",
-    "likeliest_cut",
-    "parts_of_day",
-    "scene_blocks",
-    "scenes_of",
-    "with_parts",
-]
+    "FEWEST_SCENES", "SCENE_DEGREES", "Scenes", "blocks_of", "bootstrap_blocks", "likeliest_cut",
+    "parts_of_day", "scene_blocks", "scenes_of", "with_parts",
+]  # fmt: skip
 
 FEWEST_SCENES = 3  # two blocks only show that they differ
 
@@ -226,13 +218,9 @@ _Solve = Callable[[Int[np.ndarray, " R"]], tuple[State, np.ndarray, np.ndarray]]
 
 
 def parts_of_day(
-    gradient: Float[np.ndarray, "F P"],
-    stamp_ns: Sequence[int],
-    solve: _Solve[State],
-    score: Callable[[State], Float[np.ndarray, " F"]],
-    tested: tuple[int, ...],
-    scene: Int[np.ndarray, " F"],
-) -> DayParts | None:
+    gradient: Float[np.ndarray, "F P"], stamp_ns: Sequence[int], solve: _Solve[State],
+    score: Callable[[State], Float[np.ndarray, " F"]], tested: tuple[int, ...], scene: Int[np.ndarray, " F"],
+) -> DayParts | None:  # fmt: skip
     """First and last part of a day; None if the day is too short or has too few scenes.
 
     Args:

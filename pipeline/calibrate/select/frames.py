@@ -31,15 +31,9 @@ from schemas.faults import FAULTS
 from schemas.observations import Observation
 
 __all__ = [
-    "MIN_FRAMES",
-    "PAPER_SYNC_GATE_S",
-    "SHORTEST",
-    "Selection",
-    "hold_out",
-    "missing_content",
-    "select_frames",
-    "unmet_conditions",
-]
+    "MIN_FRAMES", "PAPER_SYNC_GATE_S", "SHORTEST", "Selection", "hold_out", "missing_content",
+    "select_frames", "unmet_conditions",
+]  # fmt: skip
 
 _AZIMUTH_RAD = np.radians([-35.0, -20.0, -7.0, 7.0, 20.0, 35.0])
 _ELEVATION_RAD = np.radians([-6.0, -1.5, 1.5])
@@ -156,15 +150,10 @@ class Selection:
 
 
 def select_frames(
-    observations: Sequence[Observation],
-    config: SelectConfig,
-    *,
-    paper: bool,
-    sync_gate_s: float | None = PAPER_SYNC_GATE_S,
-    motion_gate: tuple[float, float] | None = None,
-    pairs: Sequence[str] = PAIRS,
-    absent: Mapping[str, str] | None = None,
-) -> Selection:
+    observations: Sequence[Observation], config: SelectConfig, *, paper: bool,
+    sync_gate_s: float | None = PAPER_SYNC_GATE_S, motion_gate: tuple[float, float] | None = None,
+    pairs: Sequence[str] = PAIRS, absent: Mapping[str, str] | None = None,
+) -> Selection:  # fmt: skip
     """Choose frames for the fit and held-out frames for each pair, deterministically, from frames with both sensors.
 
     Args:

@@ -114,13 +114,9 @@ def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shar
     count = count[often].astype(np.int64)
     first = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.int64) if len(count) else count
     return Shared(
-        joined[first, 0],
-        joined[first, 1],
-        first,
-        count,
-        _gathered(reference, joined[:, 0], joined[:, 2]),
+        joined[first, 0], joined[first, 1], first, count, _gathered(reference, joined[:, 0], joined[:, 2]),
         _gathered(other, joined[:, 1], joined[:, 3]),
-    )
+    )  # fmt: skip
 
 
 def bearing_sigma_rad(range_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
@@ -344,13 +340,9 @@ def _spread(z: np.ndarray) -> np.ndarray:
 
 
 def _covariance(
-    bearings: Bearings,
-    z: np.ndarray,
-    J: np.ndarray,
-    weight: np.ndarray,
-    prior_covariance: np.ndarray,
+    bearings: Bearings, z: np.ndarray, J: np.ndarray, weight: np.ndarray, prior_covariance: np.ndarray,
     rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Bootstrap covariance of the rotation over tracks, with and without the sigma of the fixed translation."""
     K = bearings.tracks
     H6, g6 = np.zeros((K, 6, 6)), np.zeros((K, 6))

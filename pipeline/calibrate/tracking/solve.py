@@ -73,14 +73,9 @@ class PairTracks:
 
 
 def solve_tracking(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    config: SolveConfig,
-    *,
-    seed: int,
-    triggered: Sequence[str] = PAIRS,
-    progress: Progress = silent,
-) -> Solution:
+    observations: Mapping[str, Sequence[Observation]], prior: Prior, config: SolveConfig, *, seed: int,
+    triggered: Sequence[str] = PAIRS, progress: Progress = silent,
+) -> Solution:  # fmt: skip
     """Track, associate, turn: camera and radar against the lidar.
 
     Args:
@@ -207,13 +202,9 @@ def _bearings(
 
 
 def _estimate(
-    pair: str,
-    tracks: PairTracks,
-    prior: Prior,
-    bearings: Bearings,
-    aligned: AlignedBearings,
+    pair: str, tracks: PairTracks, prior: Prior, bearings: Bearings, aligned: AlignedBearings,
     frame: np.ndarray,
-) -> PairEstimate:
+) -> PairEstimate:  # fmt: skip
     before = prior.covariance(pair)
     floor = np.concatenate([TRACKING_BIAS_RAD, np.zeros(3)])
     found = posterior(aligned.covariance, before, floor)

@@ -24,20 +24,10 @@ from schemas.observations import Observation
 from schemas.words import AXIS_NAMES
 
 __all__ = [
-    "DAY_CHECKS",
-    "MOVED_SIGMAS",
-    "PART_FLOOR_RAD",
-    "DayCheck",
-    "FoundDay",
-    "checks_of_day",
-    "clock_alarms",
-    "constancy_failures",
-    "far_positions",
-    "moved_failures",
-    "own_positions",
-    "prior_alarms",
+    "DAY_CHECKS", "MOVED_SIGMAS", "PART_FLOOR_RAD", "DayCheck", "FoundDay", "checks_of_day", "clock_alarms",
+    "constancy_failures", "far_positions", "moved_failures", "own_positions", "prior_alarms",
     "scene_failures",
-]
+]  # fmt: skip
 
 # --------------------------------------------------------------------------------------------------
 # Whether a day shows enough different scenes for anything to be certified: frames of a standing car are one.

@@ -49,13 +49,9 @@ class EdgeResult:
 
     @classmethod
     def of(
-        cls,
-        estimate: PairEstimate,
-        prior: np.ndarray,
-        prior_sigma: np.ndarray,
-        search: SearchRange,
+        cls, estimate: PairEstimate, prior: np.ndarray, prior_sigma: np.ndarray, search: SearchRange,
         targets: np.ndarray,
-    ) -> EdgeResult:
+    ) -> EdgeResult:  # fmt: skip
         """The result of an estimate."""
         own = estimate.pair, estimate.T, estimate.covariance, estimate.observable
         return cls(*own, prior, prior_sigma, estimate.frames_used, search, targets)

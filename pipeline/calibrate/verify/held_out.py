@@ -19,14 +19,9 @@ from pipeline.rig.targets import errors_at_targets
 from schemas.observations import Observation
 
 __all__ = [
-    "FrameDerivatives",
-    "HeldOutTest",
-    "HeldOutUpdate",
-    "found_elsewhere",
-    "held_out_place",
-    "held_out_update",
-    "paired_test",
-]
+    "FrameDerivatives", "HeldOutTest", "HeldOutUpdate", "found_elsewhere", "held_out_place",
+    "held_out_update", "paired_test",
+]  # fmt: skip
 
 # --------------------------------------------------------------------------------------------------
 # Alignment of held-out frames at the prior and at the result: a paired test over scenes of equal weight.
@@ -202,14 +197,10 @@ def held_out_place(
 
 
 def found_elsewhere(
-    estimate: PairEstimate,
-    place: Float[np.ndarray, "4 4"],
-    cost: Callable[[np.ndarray], np.ndarray],
-    sigma_rad: Float[np.ndarray, " 2"],
-    blocks: Int[np.ndarray, " F"],
-    targets: Float[np.ndarray, "N 3"],
+    estimate: PairEstimate, place: Float[np.ndarray, "4 4"], cost: Callable[[np.ndarray], np.ndarray],
+    sigma_rad: Float[np.ndarray, " 2"], blocks: Int[np.ndarray, " F"], targets: Float[np.ndarray, "N 3"],
     worse_z: float,
-) -> list[Check]:
+) -> list[Check]:  # fmt: skip
     """A failed check if held-out frames align better at a place that the result's sigma excludes.
 
     Args:

@@ -209,24 +209,15 @@ def _with_planar(T: np.ndarray, T_planar: np.ndarray) -> np.ndarray:
 
 
 def _registration_derivatives(
-    frames: RegistrationFrames,
-    T_lidar_radar: np.ndarray,
-    dt_s: float,
-    range_bias_m: float,
-    step: np.ndarray,
+    frames: RegistrationFrames, T_lidar_radar: np.ndarray, dt_s: float, range_bias_m: float, step: np.ndarray,
     width: float,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Gradient (F 8) and information (F 8 8) of the registration by yaw, x, y, time offset and range bias only."""
     T = exp_se3(step[:6]) @ T_lidar_radar
     found = normal_equations(
-        frames,
-        T,
-        dt_s + float(step[6]),
-        REGISTRATION_COMPARISON_SIGMA * np.array([width, 1.0, width]),
-        0.0,
-        OUTLIER_DENSITY,
-        range_bias_m=range_bias_m + float(step[7]),
-    )
+        frames, T, dt_s + float(step[6]), REGISTRATION_COMPARISON_SIGMA * np.array([width, 1.0, width]), 0.0,
+        OUTLIER_DENSITY, range_bias_m=range_bias_m + float(step[7]),
+    )  # fmt: skip
     # In turns about the radar and shifts: roll, pitch and z move azimuths too, but azimuths do not determine them.
     C = np.eye(8)
     C[:6, :6] = change_jacobian(T)

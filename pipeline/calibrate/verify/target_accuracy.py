@@ -55,18 +55,9 @@ from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.observations import Observation
 
 __all__ = [
-    "DIRECTIONS",
-    "Claim",
-    "camera_turn_sigma_rad",
-    "claims_of",
-    "mounting_covariance",
-    "seen_targets",
-    "target_jacobian",
-    "target_sigmas",
-    "targets_of",
-    "unseen_failure",
-    "views_of",
-]
+    "DIRECTIONS", "Claim", "camera_turn_sigma_rad", "claims_of", "mounting_covariance", "seen_targets",
+    "target_jacobian", "target_sigmas", "targets_of", "unseen_failure", "views_of",
+]  # fmt: skip
 
 DIRECTIONS = ("azimuth", "elevation")
 _CHECK_SIGMAS = 3.0
@@ -176,17 +167,12 @@ def _quantile(shift: float, sigma: float, probability: float) -> float:
 
 
 def claims_of(
-    pair: str,
-    T: Float[np.ndarray, "4 4"],
-    covariance: Float[np.ndarray, "6 6"],
-    update: HeldOutUpdate | None,
-    limit_rad: float,
-    confidence: float,
+    pair: str, T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"],
+    update: HeldOutUpdate | None, limit_rad: float, confidence: float,
     contradiction_sigmas: float = ChecksConfig().held_out_contradiction_sigmas,
-    elevation_limit_rad: float | None = None,
-    mounting: Float[np.ndarray, "6 6"] | None = None,
+    elevation_limit_rad: float | None = None, mounting: Float[np.ndarray, "6 6"] | None = None,
     targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
-) -> dict[str, Claim]:
+) -> dict[str, Claim]:  # fmt: skip
     """Claim for each direction, by name.
 
     Args:
@@ -219,15 +205,9 @@ def claims_of(
             remaining = min(sigma, max(updated, bias))
             shift = float(np.sqrt(np.mean((J @ update.shift) ** 2)))
         claims[name] = Claim(
-            sigma,
-            shift,
-            shift_sigma,
-            remaining,
-            limits_rad[d],
-            confidence,
-            contradiction_sigmas,
+            sigma, shift, shift_sigma, remaining, limits_rad[d], confidence, contradiction_sigmas,
             float(mounted[d]),
-        )
+        )  # fmt: skip
     return claims
 
 

@@ -64,13 +64,9 @@ class Verdict:
 
 
 def judge(
-    result: EdgeResult,
-    evidence: Evidence,
-    limits: ChecksConfig,
-    *,
-    triggered: bool = True,
+    result: EdgeResult, evidence: Evidence, limits: ChecksConfig, *, triggered: bool = True,
     together: bool = False,
-) -> Verdict:
+) -> Verdict:  # fmt: skip
     """Decide on one edge, of any kind.
 
     Args:

@@ -21,19 +21,9 @@ from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.store.remote_logs import LogPath, RemoteLog
 
 __all__ = [
-    "BACKENDS",
-    "BYTES_AS_TEXT",
-    "PROTOBUF",
-    "READ_ERRORS",
-    "Channel",
-    "ChunkCache",
-    "LogReader",
-    "Position",
-    "RawMessage",
-    "content_identity",
-    "leads_nowhere",
-    "open_log",
-]
+    "BACKENDS", "BYTES_AS_TEXT", "PROTOBUF", "READ_ERRORS", "Channel", "ChunkCache", "LogReader", "Position",
+    "RawMessage", "content_identity", "leads_nowhere", "open_log",
+]  # fmt: skip
 
 # Position of a message in its log; its meaning is private to the backend.
 Position = tuple[int, ...]

@@ -28,16 +28,9 @@ from pipeline.core.ros_messages import DEFINITIONS, register
 from pipeline.ingest.containers.reader import BYTES_AS_TEXT, PROTOBUF, READ_ERRORS, Channel
 
 __all__ = [
-    "DECODE_ERRORS",
-    "REFUSED",
-    "as_ros",
-    "content_without_stamp",
-    "decode",
-    "encoding_fault",
-    "foxglove_types",
-    "header_frame_id",
-    "header_stamp_ns",
-]
+    "DECODE_ERRORS", "REFUSED", "as_ros", "content_without_stamp", "decode", "encoding_fault",
+    "foxglove_types", "header_frame_id", "header_stamp_ns",
+]  # fmt: skip
 
 # For malformed bytes, errors of `decode` and of the functions that read a decoded message.
 DECODE_ERRORS = (

@@ -21,14 +21,9 @@ from jaxtyping import Float, UInt8
 from pipeline.rig.cameras import Camera
 
 __all__ = [
-    "MOST_PIXELS",
-    "EncodedImage",
-    "encode_pixels",
-    "encode_raw_image",
-    "inspect_image",
-    "label_image",
+    "MOST_PIXELS", "EncodedImage", "encode_pixels", "encode_raw_image", "inspect_image", "label_image",
     "read_camera_info",
-]
+]  # fmt: skip
 
 
 def _decode_other(data: bytes) -> np.ndarray:

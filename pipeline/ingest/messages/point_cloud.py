@@ -108,15 +108,10 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
     keep, dropped = within(range2, max_range_m, _DROPPED)
     intensity, ring = first_field(points, _INTENSITY), first_field(points, _RING)
     return LidarCloud(
-        x[keep],
-        y[keep],
-        z[keep],
-        None if intensity is None else intensity[keep].astype(np.float32),
-        _ring(ring, keep),
-        _relative_time_s(first_field(points, TIME_FIELDS), keep, stamp_ns),
-        dropped,
+        x[keep], y[keep], z[keep], None if intensity is None else intensity[keep].astype(np.float32),
+        _ring(ring, keep), _relative_time_s(first_field(points, TIME_FIELDS), keep, stamp_ns), dropped,
         unit_that_fits(np.sqrt(range2), max_range_m) if 2 * dropped.total() > len(x) else "",
-    )
+    )  # fmt: skip
 
 
 def _coordinates(points: np.ndarray) -> list[Float32[np.ndarray, " N"]]:

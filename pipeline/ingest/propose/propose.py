@@ -100,13 +100,9 @@ def _static(survey: Survey) -> tuple[str, TransformTree]:
 
 
 def _meanings(
-    survey: Survey,
-    text: str,
-    found: FoundSensors,
-    names: Mapping[str, FoundCamera | FoundCloud],
-    base: str | None,
-    progress: Progress,
-) -> dict[str, RadarMeaning]:
+    survey: Survey, text: str, found: FoundSensors, names: Mapping[str, FoundCamera | FoundCloud],
+    base: str | None, progress: Progress,
+) -> dict[str, RadarMeaning]:  # fmt: skip
     """Doppler of each radar, tested on moments of the logs, in the direction in which it looks by tf."""
     radars = {n: s for n, s in names.items() if isinstance(s, FoundCloud) and s in found.radars}
     can_be_tried = [n for n, s in sorted(radars.items()) if len(s.doppler) == 1 or not s.fields]
@@ -212,14 +208,9 @@ def names_of(found: FoundSensors) -> dict[str, FoundCamera | FoundCloud]:
 
 
 def fleet_text(
-    fleet: str,
-    found: FoundSensors,
-    names: Mapping[str, FoundCamera | FoundCloud],
-    static_topic: str,
-    untied: Mapping[str, str],
-    vehicle_frame: str | None,
-    meanings: Mapping[str, RadarMeaning],
-) -> str:
+    fleet: str, found: FoundSensors, names: Mapping[str, FoundCamera | FoundCloud], static_topic: str,
+    untied: Mapping[str, str], vehicle_frame: str | None, meanings: Mapping[str, RadarMeaning],
+) -> str:  # fmt: skip
     """Text of the file for a fleet of that name.
 
     Args:
@@ -235,19 +226,12 @@ def fleet_text(
     )
     environment.filters |= {"json": json.dumps, "beside": _beside}
     return environment.get_template("fleet.toml").render(
-        fleet=fleet,
-        found=found,
-        names=names,
-        is_short=all(name in ("camera", "lidar", "radar") for name in names),
-        static_topic=static_topic,
+        fleet=fleet, found=found, names=names,
+        is_short=all(name in ("camera", "lidar", "radar") for name in names), static_topic=static_topic,
         untied=", ".join(f"{name} ({frame or 'no frame id'})" for name, frame in untied.items()),
-        base=vehicle_frame,
-        meanings=meanings,
-        unknown=RadarMeaning(),
-        times=set(TIME_FIELDS),
-        models=semantics_line("models"),
-        left_out=left_out(found),
-    )
+        base=vehicle_frame, meanings=meanings, unknown=RadarMeaning(), times=set(TIME_FIELDS),
+        models=semantics_line("models"), left_out=left_out(found),
+    )  # fmt: skip
 
 
 def left_out(found: FoundSensors) -> list[str]:

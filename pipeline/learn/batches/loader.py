@@ -46,15 +46,9 @@ class TrainingLoader:
     """
 
     def __init__(
-        self,
-        lake: Lake,
-        batch_size: int,
-        *,
-        seed: int = 0,
-        rank_of: tuple[int, int] = (0, 1),
-        referenced: bool = False,
-        window_groups: int = 16,
-    ) -> None:
+        self, lake: Lake, batch_size: int, *, seed: int = 0, rank_of: tuple[int, int] = (0, 1),
+        referenced: bool = False, window_groups: int = 16,
+    ) -> None:  # fmt: skip
         self._lake, self._batch_size, self._seed = lake, batch_size, seed
         (self._rank, self._ranks), self._window = rank_of, window_groups
         self._chunks, self._data_key = _find_chunks(lake, "train", referenced)

@@ -111,13 +111,9 @@ _Planned = dict[Partition, tuple[list[Place], Counter[str]]]  # wanted frames, a
 
 
 def plan_frames(
-    lake: Lake,
-    days: Sequence[Partition],
-    config: PrepareConfig,
-    output: Output,
-    settings: Mapping[str, Any],
+    lake: Lake, days: Sequence[Partition], config: PrepareConfig, output: Output, settings: Mapping[str, Any],
     progress: Progress,
-) -> tuple[_Planned, dict[str, Any]]:
+) -> tuple[_Planned, dict[str, Any]]:  # fmt: skip
     """Divide the frames of all days by `[prepare]`; splits of earlier runs and of table `training` stay.
 
     Returns the frames, and the settings of the export with those of its splits.

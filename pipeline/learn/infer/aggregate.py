@@ -131,25 +131,16 @@ def day_estimate(
     covariance = (covariance + covariance.T) / 2
     bias = twist_of_bearing @ np.diag(np.square(answers.bias_sigma)) @ twist_of_bearing.T
     return PairEstimate(
-        pair,
-        exp_se3(twist_of_bearing @ x) @ answers.T_centre,
-        covariance,
-        observability,
-        observable,
-        answers.frames,
-        diagnostics=_diagnostics(fit, gain, answers),
+        pair, exp_se3(twist_of_bearing @ x) @ answers.T_centre, covariance, observability, observable,
+        answers.frames, diagnostics=_diagnostics(fit, gain, answers),
         common_covariance=common_of(covariance, prior_covariance, bias),
-    )
+    )  # fmt: skip
 
 
 def measured_estimate(
-    T: Float[np.ndarray, "4 4"],
-    information: Float[np.ndarray, "6 6"],
-    bias_sigma: Float[np.ndarray, " 6"],
-    T_prior: Float[np.ndarray, "4 4"],
-    prior_covariance: Float[np.ndarray, "6 6"],
-    frames: int,
-) -> PairEstimate:
+    T: Float[np.ndarray, "4 4"], information: Float[np.ndarray, "6 6"], bias_sigma: Float[np.ndarray, " 6"],
+    T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"], frames: int,
+) -> PairEstimate:  # fmt: skip
     """Estimate of camera-lidar from a fit of all frames under the prior, with an error common to all frames.
 
     Args:
@@ -175,14 +166,9 @@ def measured_estimate(
     covariance = back @ (keep @ P @ keep.T + gain @ told @ gain.T) @ back.T
     covariance = (covariance + covariance.T) / 2
     return PairEstimate(
-        "camera_lidar",
-        exp_se3(x) @ T,
-        covariance,
-        observability,
-        observable,
-        frames,
+        "camera_lidar", exp_se3(x) @ T, covariance, observability, observable, frames,
         common_covariance=common_of(covariance, prior_covariance, back @ bias @ back.T),
-    )
+    )  # fmt: skip
 
 
 def mean_answer(
@@ -272,13 +258,9 @@ def _bootstrap(answers: Answers, fit: _Fit, rng: np.random.Generator) -> Float[n
 
 
 def _update(
-    m0: np.ndarray,
-    P: np.ndarray,
-    H: np.ndarray,
-    R: np.ndarray,
-    z: np.ndarray,
+    m0: np.ndarray, P: np.ndarray, H: np.ndarray, R: np.ndarray, z: np.ndarray,
     keep: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Kalman update of mean and covariance; rows of `keep` are considered, not updated (Schmidt-Kalman)."""
     S = H @ P @ H.T + R
     K = np.linalg.solve(S, H @ P).T

@@ -184,10 +184,7 @@ def climbed(
 
 
 def fit_of(
-    frames: Sequence[FrameEvidence],
-    block: Int[np.ndarray, " F"],
-    start: _Place,
-    expected: Expected,
+    frames: Sequence[FrameEvidence], block: Int[np.ndarray, " F"], start: _Place, expected: Expected
 ) -> JointFit:
     """Optimise from a start, and estimate the peak's sigma; errors within a `block` (scene) are correlated."""
     at, worth = start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
@@ -205,10 +202,7 @@ def fit_of(
 
 
 def rival_score(
-    frames: Sequence[FrameEvidence],
-    block: Int[np.ndarray, " F"],
-    place: _Place,
-    rival: _Place,
+    frames: Sequence[FrameEvidence], block: Int[np.ndarray, " F"], place: _Place, rival: _Place
 ) -> float:
     """By how many sigmas of the scenes' scatter frames prefer a pose to its rival; infinite where both are one peak."""
     if float(rotation_angle_rad(place[0] @ inverse(rival[0]))) < APART_RAD:

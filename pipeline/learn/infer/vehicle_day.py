@@ -88,17 +88,10 @@ class FrameNetwork(Protocol):
 
 
 def solve_by_networks(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    *,
-    networks: Sequence[FrameNetwork],
-    frames: FrameSource,
-    method: str,
-    seed: int,
-    clock_sigma_s: float,
-    triggered: Sequence[str] = PAIRS,
+    observations: Mapping[str, Sequence[Observation]], prior: Prior, *, networks: Sequence[FrameNetwork],
+    frames: FrameSource, method: str, seed: int, clock_sigma_s: float, triggered: Sequence[str] = PAIRS,
     progress: Progress = silent,
-) -> Solution:
+) -> Solution:  # fmt: skip
     """Estimate all triggered pairs; the others keep the prior.
 
     Args:
@@ -142,14 +135,9 @@ def solve_by_networks(
 
 
 def single_frame_solution(
-    frame: Frame,
-    observation: Observation,
-    prior: Prior,
-    *,
-    networks: Sequence[FrameNetwork],
-    method: str,
+    frame: Frame, observation: Observation, prior: Prior, *, networks: Sequence[FrameNetwork], method: str,
     seed: int,
-) -> Solution:
+) -> Solution:  # fmt: skip
     """Solution from one frame: its answers at many guesses, with at least the predicted variance.
 
     Raises:
@@ -217,14 +205,9 @@ class _Asked:
 
 
 def _asked_day(
-    observations: Mapping[str, Sequence[Observation]],
-    prior: Prior,
-    networks: Sequence[FrameNetwork],
-    frames: FrameSource,
-    rng: np.random.Generator,
-    progress: Progress,
-    clock_sigma_s: float,
-) -> tuple[_Asked, dict[str, Answers], Counter[str], JointDay | None]:
+    observations: Mapping[str, Sequence[Observation]], prior: Prior, networks: Sequence[FrameNetwork],
+    frames: FrameSource, rng: np.random.Generator, progress: Progress, clock_sigma_s: float,
+) -> tuple[_Asked, dict[str, Answers], Counter[str], JointDay | None]:  # fmt: skip
     """Prepare all frames, iterate the guess on pilot frames, fit camera-lidar to all frames, run all frames.
 
     Also counts rejected frames by reason. The fit is None if no network returns its evidence.
@@ -338,16 +321,12 @@ def _ask(
         bias |= {pair: network.bias_sigma[pair] for pair in network.pairs if pair in network.bias_sigma}
     return {
         pair: Answers(
-            centre[pair],
-            twists_about(centre[pair], np.stack([g[pair] for g in guesses])),
-            twists_about(centre[pair], np.stack(answers[pair])),
-            np.stack(variances[pair]),
-            block,
-            len(set(rows)),
-            bias[pair],
+            centre[pair], twists_about(centre[pair], np.stack([g[pair] for g in guesses])),
+            twists_about(centre[pair], np.stack(answers[pair])), np.stack(variances[pair]), block,
+            len(set(rows)), bias[pair],
         )
         for pair in PAIRS
-    }
+    }  # fmt: skip
 
 
 def _scattered(

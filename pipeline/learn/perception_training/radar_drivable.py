@@ -113,16 +113,10 @@ def _scan_of(observation: Observation) -> Scan:
     velocity, speed = observation.radar_velocity_mps, observation.ego_speed_mps
     own = None if speed is None else (float(speed), 0.0)
     return Scan(
-        observation.radar_stamp_ns,
-        observation.drive,
-        observation.radar_xyz_m,
-        observation.radar_power_db,
-        observation.radar_residual_mps,
-        observation.radar_motion,
-        observation.radar_has_elevation,
-        own if velocity is None else (float(velocity[0]), float(velocity[1])),
-        observation.ego_yaw_rate_radps,
-    )
+        observation.radar_stamp_ns, observation.drive, observation.radar_xyz_m, observation.radar_power_db,
+        observation.radar_residual_mps, observation.radar_motion, observation.radar_has_elevation,
+        own if velocity is None else (float(velocity[0]), float(velocity[1])), observation.ego_yaw_rate_radps,
+    )  # fmt: skip
 
 
 def label_grid(observation: Observation, T_lidar_radar: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "A R"]:

@@ -139,13 +139,9 @@ def split_days(days: Sequence[Partition], samples_of: Callable[[Partition], R]) 
 
 
 def train_network(
-    task: type[Task[R]],
-    samples: Samples[R],
-    out: Path,
-    config: TrainingConfig,
-    time_limit_s: float | None = None,
-    progress: Progress = silent,
-) -> tuple[nn.Module, TrainResult]:
+    task: type[Task[R]], samples: Samples[R], out: Path, config: TrainingConfig,
+    time_limit_s: float | None = None, progress: Progress = silent,
+) -> tuple[nn.Module, TrainResult]:  # fmt: skip
     """Train, or continue the run in `out`, until it is finished, the time is up or a signal stops it.
 
     Leaves last.pt and metrics.jsonl there; the result reports the scores on held-out samples.

@@ -20,14 +20,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_columns, read_manifest
 from schemas.training import SPLITS, TRAINING
 
-__all__ = [
-    "Inventory",
-    "doubts",
-    "read_leaks",
-    "require_sides",
-    "take_inventory",
-    "write_inventory",
-]
+__all__ = ["Inventory", "doubts", "read_leaks", "require_sides", "take_inventory", "write_inventory"]
 
 _CHUNK = 4096
 _COLUMNS = ("frame_index", "split", "environment", "fingerprint")

@@ -52,13 +52,9 @@ class SplitPlan:
 
 
 def plan_split(
-    units: Sequence[Unit],
-    by: Sequence[str],
-    val_fraction: float,
-    test_fraction: float,
-    seed: int = 0,
+    units: Sequence[Unit], by: Sequence[str], val_fraction: float, test_fraction: float, seed: int = 0,
     decided: Mapping[tuple[str, str], str] | None = None,
-) -> SplitPlan:
+) -> SplitPlan:  # fmt: skip
     """Divide units; the same input gives the same plan.
 
     Args:

@@ -18,14 +18,7 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND
 
-__all__ = [
-    "View",
-    "lidar_columns",
-    "own_velocity",
-    "padded_rows",
-    "radar_columns",
-    "range_edges",
-]
+__all__ = ["View", "lidar_columns", "own_velocity", "padded_rows", "radar_columns", "range_edges"]
 
 _NEAR_M, _FAR_M = 2.5, 120.0
 _MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much still brings into view

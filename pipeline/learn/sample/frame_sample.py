@@ -30,17 +30,9 @@ from schemas.observations import Observation
 from schemas.training import CLASS_OF_LABEL, GRID_CLASSES, NO_EDGE, UNKNOWN_CLASS, TrainingRow
 
 __all__ = [
-    "About",
-    "Reference",
-    "SampleReason",
-    "SampleRejectedError",
-    "camera_features",
-    "class_likelihood",
-    "fingerprint",
-    "make_row",
-    "sensor_row",
-    "stored_grid",
-]
+    "About", "Reference", "SampleReason", "SampleRejectedError", "camera_features", "class_likelihood",
+    "fingerprint", "make_row", "sensor_row", "stored_grid",
+]  # fmt: skip
 
 _DETECTIONS = 24
 _MIN_POINTS = 300  # fewer in view show a network no shape

@@ -22,30 +22,11 @@ from pipeline.rig.cameras import Camera
 from schemas.training import GRID_CLASSES
 
 __all__ = [
-    "CAMERA_CHANNELS",
-    "CLASS_CHANNELS",
-    "CLASS_CONFIDENCE",
-    "EVIDENCE",
-    "FEATURE_UNITS",
-    "GRAPH_INPUTS",
-    "LIDAR_CHANNELS",
-    "LIDAR_FEATURES",
-    "LIKELIHOOD",
-    "MARKED_POINTS",
-    "MARK_FLAT",
-    "MARK_LEAST_SHARE",
-    "MATCHED_POINTS",
-    "NEAR_M",
-    "OBJECT_POINTS",
-    "PAIRS",
-    "RADAR_CHANNELS",
-    "RADAR_FEATURES",
-    "RADAR_POINTS",
-    "Grid",
-    "NetworkConfig",
-    "grid_rays",
-    "resample_camera",
-]
+    "CAMERA_CHANNELS", "CLASS_CHANNELS", "CLASS_CONFIDENCE", "EVIDENCE", "FEATURE_UNITS", "GRAPH_INPUTS",
+    "LIDAR_CHANNELS", "LIDAR_FEATURES", "LIKELIHOOD", "MARKED_POINTS", "MARK_FLAT", "MARK_LEAST_SHARE",
+    "MATCHED_POINTS", "NEAR_M", "OBJECT_POINTS", "PAIRS", "RADAR_CHANNELS", "RADAR_FEATURES", "RADAR_POINTS",
+    "Grid", "NetworkConfig", "grid_rays", "resample_camera",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)

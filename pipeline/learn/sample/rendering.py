@@ -151,14 +151,9 @@ def render_frame(
 
 
 def render_lidar(
-    xyz_m: Float32[np.ndarray, "N 3"],
-    features: Float32[np.ndarray, "N 4"],
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    grid: Grid,
-    *,
-    marks: bool = True,
-    nearness: float = 1.0,
-) -> tuple[dict[str, np.ndarray], Int32[np.ndarray, " HW"]]:
+    xyz_m: Float32[np.ndarray, "N 3"], features: Float32[np.ndarray, "N 4"],
+    T_camera_lidar: Float[np.ndarray, "4 4"], grid: Grid, *, marks: bool = True, nearness: float = 1.0,
+) -> tuple[dict[str, np.ndarray], Int32[np.ndarray, " HW"]]:  # fmt: skip
     """A sweep's inputs of the graph by name, and the point of each cell, -1 in empty ones.
 
     Without `marks` those of bright ground are empty. `nearness` multiplies the rendered nearness (training looks

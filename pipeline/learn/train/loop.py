@@ -28,22 +28,9 @@ from pipeline.core.results import Progress
 from pipeline.learn.train.settings import DescentConfig
 
 __all__ = [
-    "ALONE",
-    "BEST",
-    "LAST",
-    "DivergedError",
-    "DivergenceGuard",
-    "MetricsLog",
-    "Processes",
-    "Run",
-    "TrainResult",
-    "joined",
-    "load_checkpoint",
-    "read_metrics",
-    "run_loop",
-    "save_checkpoint",
-    "stop_signals",
-]
+    "ALONE", "BEST", "LAST", "DivergedError", "DivergenceGuard", "MetricsLog", "Processes", "Run",
+    "TrainResult", "joined", "load_checkpoint", "read_metrics", "run_loop", "save_checkpoint", "stop_signals",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -308,13 +295,9 @@ class Run(ABC):
 
 
 def run_loop(
-    run: Run,
-    folder: Path,
-    log: MetricsLog | None,
-    stops: list[int],
-    time_limit_s: float | None,
+    run: Run, folder: Path, log: MetricsLog | None, stops: list[int], time_limit_s: float | None,
     progress: Progress,
-) -> TrainResult:
+) -> TrainResult:  # fmt: skip
     """Train until the run is finished, the time is up or a signal stops it; leaves last.pt in the folder.
 
     Args:

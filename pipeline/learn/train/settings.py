@@ -15,14 +15,9 @@ from pipeline.core.config import read_toml, validated
 from pipeline.learn.sample.grid import PAIRS, Grid, NetworkConfig
 
 __all__ = [
-    "PAIRS_OF",
-    "AugmentConfig",
-    "DescentConfig",
-    "LossConfig",
-    "StrangeConfig",
-    "TrainConfig",
+    "PAIRS_OF", "AugmentConfig", "DescentConfig", "LossConfig", "StrangeConfig", "TrainConfig",
     "load_train_config",
-]
+]  # fmt: skip
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

@@ -32,13 +32,9 @@ _FEWEST_OF_KIND = 40  # fewer do not separate a share from chance
 
 
 def edge_scores(
-    camera: Float32[np.ndarray, " 18"],
-    offsets: Int8[np.ndarray, "I 4 H W"],
-    edges: Points,
-    poses: Float32[np.ndarray, "P F 12"],
-    focal: Float32[np.ndarray, " P"],
-    settings: KernelSettings,
-) -> Float32[np.ndarray, "P F"]:
+    camera: Float32[np.ndarray, " 18"], offsets: Int8[np.ndarray, "I 4 H W"], edges: Points,
+    poses: Float32[np.ndarray, "P F 12"], focal: Float32[np.ndarray, " P"], settings: KernelSettings,
+) -> Float32[np.ndarray, "P F"]:  # fmt: skip
     """Log likelihood ratio of each frame at each pose; points outside the image count 0.
 
     Args:
@@ -57,30 +53,16 @@ def edge_scores(
     # 2/pi makes (1 + x^2)^-2 a density
     gain = settings.match[:, None] * np.float32(2 / np.pi) / settings.chance
     return _edge_loop(
-        camera,
-        offsets,
-        np.ascontiguousarray(edges.xyz_m.T),
-        edges.side,
-        edges.kind,
-        1 / width_px,
-        edges.start,
-        edges.image,
-        poses,
-        focal,
-        1 - settings.match,
-        gain,
-    )
+        camera, offsets, np.ascontiguousarray(edges.xyz_m.T), edges.side, edges.kind, 1 / width_px,
+        edges.start, edges.image, poses, focal, 1 - settings.match, gain,
+    )  # fmt: skip
 
 
 def edge_gradients(
-    camera: Float32[np.ndarray, " 18"],
-    offsets: Int8[np.ndarray, "I 4 H W"],
-    edges: Points,
-    poses: Float64[np.ndarray, "F 12"],
-    focal: float,
-    motion: Float64[np.ndarray, "F 4"],
+    camera: Float32[np.ndarray, " 18"], offsets: Int8[np.ndarray, "I 4 H W"], edges: Points,
+    poses: Float64[np.ndarray, "F 12"], focal: float, motion: Float64[np.ndarray, "F 4"],
     settings: KernelSettings,
-) -> tuple[Float64[np.ndarray, "F 11"], Float64[np.ndarray, "F 11 11"]]:
+) -> tuple[Float64[np.ndarray, "F 11"], Float64[np.ndarray, "F 11 11"]]:  # fmt: skip
     """Gradient of each frame's score at ONE pose, and its information.
 
     By left perturbation of T_camera_lidar (rotation [rad], translation [m]), time offset [s], focal scale,
@@ -97,31 +79,15 @@ def edge_gradients(
         settings: as for `edge_scores`.
     """
     return _gradient_loop(
-        camera,
-        offsets,
-        edges.xyz_m,
-        edges.side,
-        edges.kind,
-        edges.gap_rad,
-        edges.start,
-        edges.image,
-        poses,
-        focal,
-        motion,
-        settings.match,
-        settings.chance,
-        settings.sigma_px,
-    )
+        camera, offsets, edges.xyz_m, edges.side, edges.kind, edges.gap_rad, edges.start, edges.image, poses,
+        focal, motion, settings.match, settings.chance, settings.sigma_px,
+    )  # fmt: skip
 
 
 def edge_residuals(
-    camera: Float32[np.ndarray, " 18"],
-    offsets: Int8[np.ndarray, "I 4 H W"],
-    edges: Points,
-    poses: Float32[np.ndarray, "F 12"],
-    focal: np.float32,
-    shift_px: Float32[np.ndarray, "N 2"],
-) -> Float32[np.ndarray, " N"]:
+    camera: Float32[np.ndarray, " 18"], offsets: Int8[np.ndarray, "I 4 H W"], edges: Points,
+    poses: Float32[np.ndarray, "F 12"], focal: np.float32, shift_px: Float32[np.ndarray, "N 2"],
+) -> Float32[np.ndarray, " N"]:  # fmt: skip
     """Signed distance [px] of each jump, moved by `shift_px`, to its boundary at ONE pose; 127 without one.
 
     NaN outside the image.
@@ -133,19 +99,10 @@ def edge_residuals(
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _edge_loop(
-    camera: np.ndarray,
-    offsets: np.ndarray,
-    xyz: np.ndarray,
-    side: np.ndarray,
-    kind: np.ndarray,
-    sharpness: np.ndarray,
-    start: np.ndarray,
-    image: np.ndarray,
-    poses: np.ndarray,
-    focal: np.ndarray,
-    base: np.ndarray,
-    gain: np.ndarray,
-) -> np.ndarray:
+    camera: np.ndarray, offsets: np.ndarray, xyz: np.ndarray, side: np.ndarray, kind: np.ndarray,
+    sharpness: np.ndarray, start: np.ndarray, image: np.ndarray, poses: np.ndarray, focal: np.ndarray,
+    base: np.ndarray, gain: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """The sum of log(base + gain sharpness (1 + (r sharpness)^2)^-2) over each frame's points.
 
     Steps over few arrays without branches become vector instructions; unpredictable branches took two thirds
@@ -179,14 +136,9 @@ _UNSEEN = np.float32(1e6)  # px: no distance in an image
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _places(
-    us: np.ndarray,
-    vs: np.ndarray,
-    side: np.ndarray,
-    width: int,
-    height: int,
-    place: np.ndarray,
+    us: np.ndarray, vs: np.ndarray, side: np.ndarray, width: int, height: int, place: np.ndarray,
     rest: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Where in its frame's flat map each point looks, and from there to the point along its axis [px]."""
     half, zero = np.float32(0.5), np.float32(0)
     u_max, v_max = np.float32(width - 1), np.float32(height - 1)
@@ -205,14 +157,9 @@ def _places(
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _ratios(
-    found: np.ndarray,
-    rest: np.ndarray,
-    sharpness: np.ndarray,
-    floor: np.ndarray,
-    row: np.ndarray,
-    gains: np.ndarray,
-    ratio: np.ndarray,
-) -> None:
+    found: np.ndarray, rest: np.ndarray, sharpness: np.ndarray, floor: np.ndarray, row: np.ndarray,
+    gains: np.ndarray, ratio: np.ndarray,
+) -> None:  # fmt: skip
     """Likelihood ratio of each point; 1 outside the image."""
     one, last = np.float32(1), np.float32(CHANCE_BINS - 1)
     for i in range(found.shape[0]):
@@ -244,21 +191,10 @@ def _sum_of_logs(x: np.ndarray) -> float:
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def _gradient_loop(
-    camera: np.ndarray,
-    offsets: np.ndarray,
-    points: np.ndarray,
-    side: np.ndarray,
-    kind: np.ndarray,
-    gap_rad: np.ndarray,
-    start: np.ndarray,
-    image: np.ndarray,
-    poses: np.ndarray,
-    focal: float,
-    motion: np.ndarray,
-    match: np.ndarray,
-    chance: np.ndarray,
-    sigma_px: float,
-) -> tuple[np.ndarray, np.ndarray]:
+    camera: np.ndarray, offsets: np.ndarray, points: np.ndarray, side: np.ndarray, kind: np.ndarray,
+    gap_rad: np.ndarray, start: np.ndarray, image: np.ndarray, poses: np.ndarray, focal: float,
+    motion: np.ndarray, match: np.ndarray, chance: np.ndarray, sigma_px: float,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Sums over each frame's points of weighted gradients and their outer products."""
     frames = poses.shape[0]
     height, width = offsets.shape[2], offsets.shape[3]
@@ -307,16 +243,9 @@ def _gradient_loop(
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def _residual_loop(
-    camera: np.ndarray,
-    offsets: np.ndarray,
-    points: np.ndarray,
-    side: np.ndarray,
-    start: np.ndarray,
-    image: np.ndarray,
-    poses: np.ndarray,
-    focal: float,
-    shift_px: np.ndarray,
-) -> np.ndarray:
+    camera: np.ndarray, offsets: np.ndarray, points: np.ndarray, side: np.ndarray, start: np.ndarray,
+    image: np.ndarray, poses: np.ndarray, focal: float, shift_px: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """The loop of `edge_residuals`."""
     height, width = offsets.shape[2], offsets.shape[3]
     out = np.full(points.shape[0], np.nan, np.float32)

@@ -23,16 +23,9 @@ if TYPE_CHECKING:
     from schemas.observations import Observation
 
 __all__ = [
-    "CONTRAST_STEP",
-    "NO_BOUNDARY",
-    "CameraMaps",
-    "Start",
-    "boundary_offsets",
-    "contrast_levels",
-    "free_ground",
-    "prepare_maps",
-    "step_offsets",
-]
+    "CONTRAST_STEP", "NO_BOUNDARY", "CameraMaps", "Start", "boundary_offsets", "contrast_levels",
+    "free_ground", "prepare_maps", "step_offsets",
+]  # fmt: skip
 
 NO_BOUNDARY = -128  # no boundary of this direction within REACH_PX
 REACH_PX = 96

@@ -27,18 +27,9 @@ from pipeline.rig.cameras import Camera
 from schemas.observations import Observation
 
 __all__ = [
-    "CLASSES",
-    "EDGE_KINDS",
-    "Points",
-    "exposed",
-    "gathered",
-    "is_near_view",
-    "lidar_velocities",
-    "motion_in_camera",
-    "moving_poses",
-    "row_delays_s",
-    "view_bounds",
-]
+    "CLASSES", "EDGE_KINDS", "Points", "exposed", "gathered", "is_near_view", "lidar_velocities",
+    "motion_in_camera", "moving_poses", "row_delays_s", "view_bounds",
+]  # fmt: skip
 
 # Markings brighter than this stand out of their ring (lane paint, patches) [robust sd].
 _MARKING_Z = 2.5
@@ -179,26 +170,18 @@ def _gather(
         counts.append(counts[-1] + int(near.sum()))
     columns = [np.concatenate(c) for c in zip(*kept, strict=True)]
     return Points(
-        np.ascontiguousarray(columns[0], np.float32),
-        np.array(counts, np.int64),
-        columns[1].astype(np.uint8),
-        columns[2].astype(np.uint8),
-        columns[3].astype(np.float32),
-        np.zeros(len(columns[0]), np.float32),
+        np.ascontiguousarray(columns[0], np.float32), np.array(counts, np.int64), columns[1].astype(np.uint8),
+        columns[2].astype(np.uint8), columns[3].astype(np.float32), np.zeros(len(columns[0]), np.float32),
         np.arange(len(frames), dtype=np.int64),
-    )
+    )  # fmt: skip
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def moving_poses(
-    R: np.ndarray,
-    t: np.ndarray,
-    dt_s: np.ndarray,
-    gap_s: np.ndarray,
-    velocity: np.ndarray,
+    R: np.ndarray, t: np.ndarray, dt_s: np.ndarray, gap_s: np.ndarray, velocity: np.ndarray,
     yaw_rate: np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """[R Rz(yaw_rate tau) | R Rz(yaw_rate tau) v tau + t] as rows, tau = dt - gap, for each pose and frame."""
     count, frames = R.shape[0], velocity.shape[0]
     out = np.empty((count, frames, 12), np.float32)
@@ -253,13 +236,9 @@ def row_delays_s(v_px: Float[np.ndarray, " N"], height_px: int, readout_s: float
 
 
 def exposed(
-    points: Points,
-    poses: Float[np.ndarray, "F 12"],
-    camera: Camera,
-    velocity_lidar: Float[np.ndarray, "F 3"],
-    yaw_rate: Float[np.ndarray, " F"],
-    readout_s: float,
-) -> Points:
+    points: Points, poses: Float[np.ndarray, "F 12"], camera: Camera,
+    velocity_lidar: Float[np.ndarray, "F 3"], yaw_rate: Float[np.ndarray, " F"], readout_s: float,
+) -> Points:  # fmt: skip
     """Points where their image rows saw them.
 
     Args:

@@ -15,14 +15,9 @@ if TYPE_CHECKING:
     from pipeline.rig.cameras import Camera
 
 __all__ = [
-    "along_motion",
-    "camera_parameters",
-    "count_in_view",
-    "most_points",
-    "project_point",
-    "project_points",
+    "along_motion", "camera_parameters", "count_in_view", "most_points", "project_point", "project_points",
     "project_with_jacobian",
-]
+]  # fmt: skip
 
 _PINHOLE, _DISTORTED, _EQUIDISTANT = 0.0, 1.0, 2.0
 _POLYNOMIAL_DEGREE = 9
@@ -100,15 +95,9 @@ def most_points(start: np.ndarray) -> int:
 @no_type_check
 @numba.njit(fastmath=True, nogil=True, cache=True, forceinline=True, error_model="numpy")
 def project_points(
-    c: np.ndarray,
-    xyz: np.ndarray,
-    begin: int,
-    end: int,
-    pose: np.ndarray,
-    focal: float,
-    u: np.ndarray,
+    c: np.ndarray, xyz: np.ndarray, begin: int, end: int, pose: np.ndarray, focal: float, u: np.ndarray,
     v: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill u, v [px] of points xyz[3, begin:end] by the rows of a 3x4 transform; u = -1 if not visible.
 
     The loops have no branches, so that they compile to vector instructions: 1 ns a point. `focal` scales the
@@ -228,14 +217,7 @@ def project_with_jacobian(
 @no_type_check
 @numba.njit(inline="always", nogil=True)
 def along_motion(
-    pose: np.ndarray,
-    motion: np.ndarray,
-    x: float,
-    y: float,
-    z: float,
-    dx: float,
-    dy: float,
-    dz: float,
+    pose: np.ndarray, motion: np.ndarray, x: float, y: float, z: float, dx: float, dy: float, dz: float
 ) -> float:
     """Derivative by the time offset of a quantity with derivatives (dx, dy, dz) by a camera point (x, y, z).
 

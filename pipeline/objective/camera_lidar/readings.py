@@ -36,15 +36,10 @@ _LABELS = 20  # 19 Cityscapes classes and void
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def marking_scores(
-    camera: Float32[np.ndarray, " 18"],
-    contrast: Int8[np.ndarray, "I H W"],
-    points: Float32[np.ndarray, "N 3"],
-    weight: Float32[np.ndarray, " N"],
-    start: Int64[np.ndarray, " G"],
-    image: Int64[np.ndarray, " F"],
-    poses: Float32[np.ndarray, "P F 12"],
-    focal: Float32[np.ndarray, " P"],
-) -> Float32[np.ndarray, "P F"]:
+    camera: Float32[np.ndarray, " 18"], contrast: Int8[np.ndarray, "I H W"],
+    points: Float32[np.ndarray, "N 3"], weight: Float32[np.ndarray, " N"], start: Int64[np.ndarray, " G"],
+    image: Int64[np.ndarray, " F"], poses: Float32[np.ndarray, "P F 12"], focal: Float32[np.ndarray, " P"],
+) -> Float32[np.ndarray, "P F"]:  # fmt: skip
     """Weighted sum of the contrast under each frame's points at each pose; 0 outside the road."""
     count, frames = poses.shape[0], poses.shape[1]
     height, width = contrast.shape[1], contrast.shape[2]
@@ -65,14 +60,9 @@ def marking_scores(
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, forceinline=True, fastmath=True, nogil=True, error_model="numpy")
 def _weighted_sum(
-    map_: np.ndarray,
-    us: np.ndarray,
-    vs: np.ndarray,
-    weight: np.ndarray,
-    width: int,
-    height: int,
+    map_: np.ndarray, us: np.ndarray, vs: np.ndarray, weight: np.ndarray, width: int, height: int,
     place: np.ndarray,
-) -> float:
+) -> float:  # fmt: skip
     """Weighted sum of a flat map's values between pixels; branch-free, because branches are unpredictable."""
     zero = np.float32(0)
     u_max, v_max = np.float32(width - 1.01), np.float32(height - 1.01)
@@ -96,16 +86,9 @@ def _weighted_sum(
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
 def marking_gradients(
-    camera: np.ndarray,
-    contrast: np.ndarray,
-    points: np.ndarray,
-    weight: np.ndarray,
-    start: np.ndarray,
-    image: np.ndarray,
-    poses: np.ndarray,
-    focal: float,
-    motion: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    camera: np.ndarray, contrast: np.ndarray, points: np.ndarray, weight: np.ndarray, start: np.ndarray,
+    image: np.ndarray, poses: np.ndarray, focal: float, motion: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Gradient [F, 11] of each frame's score and its information [F, 11, 11].
 
     By rotation, translation, time offset, focal scale, principal point and readout time. As in
@@ -153,15 +136,10 @@ def marking_gradients(
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def class_information(
-    camera: Float32[np.ndarray, " 18"],
-    labels: UInt8[np.ndarray, "I H W"],
-    points: Float32[np.ndarray, "N 3"],
-    kind: UInt8[np.ndarray, " N"],
-    start: Int64[np.ndarray, " G"],
-    image: Int64[np.ndarray, " F"],
-    poses: Float32[np.ndarray, "P F 12"],
-    kinds: int,
-) -> Float64[np.ndarray, " P"]:
+    camera: Float32[np.ndarray, " 18"], labels: UInt8[np.ndarray, "I H W"],
+    points: Float32[np.ndarray, "N 3"], kind: UInt8[np.ndarray, " N"], start: Int64[np.ndarray, " G"],
+    image: Int64[np.ndarray, " F"], poses: Float32[np.ndarray, "P F 12"], kinds: int,
+) -> Float64[np.ndarray, " P"]:  # fmt: skip
     """Nats per projected point times the share of points that project into the image, at each pose, over all frames."""
     count, frames = poses.shape[0], poses.shape[1]
     height, width = labels.shape[1], labels.shape[2]

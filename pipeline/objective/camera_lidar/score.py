@@ -38,14 +38,7 @@ from pipeline.objective.camera_lidar.readings import class_information, marking_
 from pipeline.objective.stamp_gaps import gaps_s
 from schemas.observations import EDGE_ABOVE, Observation
 
-__all__ = [
-    "CONTRAST_BLURS_PX",
-    "Alignments",
-    "KernelSettings",
-    "Start",
-    "Terms",
-    "prepare_terms",
-]
+__all__ = ["CONTRAST_BLURS_PX", "Alignments", "KernelSettings", "Start", "Terms", "prepare_terms"]
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
 # Shifts of the image [label px] that give the chance score of the same points.
@@ -321,14 +314,10 @@ def _weights(markings: Points, settings: KernelSettings) -> np.ndarray:
 
 
 def prepare_terms(
-    observations: Sequence[Observation],
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    velocity_lidar: Float[np.ndarray, "F 3"],
-    *,
-    reach_rad: float,
-    readout_s: float = 0.0,
+    observations: Sequence[Observation], T_camera_lidar: Float[np.ndarray, "4 4"],
+    velocity_lidar: Float[np.ndarray, "F 3"], *, reach_rad: float, readout_s: float = 0.0,
     start: Start | None = None,
-) -> Terms:
+) -> Terms:  # fmt: skip
     """Decode maps and gather the points that can come into view within `reach_rad` of a pose.
 
     `readout_s` is the rolling shutter's, from the first image row to the last; `Terms.exposed_at` brings it

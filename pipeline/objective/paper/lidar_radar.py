@@ -64,15 +64,9 @@ class LidarRadarLoss:
         T = np.ascontiguousarray(T_lidar_radar, np.float64)
         tracks = np.zeros((len(T), len(self.flat)))
         _nearest_costs(
-            T,
-            self.tracks_radar,
-            self.track_first,
-            self.centres_lidar,
-            self.centre_first,
-            self.flat,
-            SCALE_M,
+            T, self.tracks_radar, self.track_first, self.centres_lidar, self.centre_first, self.flat, SCALE_M,
             tracks,
-        )
+        )  # fmt: skip
         tracks /= np.maximum(np.diff(self.track_first), 1)
         iou = self.drivable_iou(T)
         return np.where(self._has_areas, 1 - iou, 0.0) + np.where(self._has_tracks, tracks, 0.0)
@@ -102,14 +96,10 @@ def lidar_radar_loss(observations: Sequence[Observation]) -> LidarRadarLoss:
         centres.append(observation.lidar_cluster_centre_m.astype(np.float64))
     radar_maps = np.stack(maps) if maps else np.zeros((0, *_CELLS), np.float32)
     return LidarRadarLoss(
-        *_stacked(drivable, np.float32),
-        np.array(areas),
-        radar_maps,
-        radar_maps.sum(axis=(1, 2), dtype=np.float64) * CELL_M**2,
-        *_stacked(tracks, np.float64),
-        *_stacked(centres, np.float64),
-        np.array([not o.radar_has_elevation for o in observations], bool),
-    )
+        *_stacked(drivable, np.float32), np.array(areas), radar_maps,
+        radar_maps.sum(axis=(1, 2), dtype=np.float64) * CELL_M**2, *_stacked(tracks, np.float64),
+        *_stacked(centres, np.float64), np.array([not o.radar_has_elevation for o in observations], bool),
+    )  # fmt: skip
 
 
 def drivable_map(

@@ -24,16 +24,10 @@ from pipeline.rig.se3 import camera_direction_angles, inverse, transform_points,
 from schemas.observations import Observation
 
 __all__ = [
-    "MATCH_RAD",
-    "ROAD_USER_HEIGHT_M",
-    "MovingClusters",
-    "azimuth_equations_camera",
-    "azimuth_equations_lidar",
-    "camera_azimuth_residuals",
-    "camera_radar_cost",
-    "lidar_azimuth_residuals",
+    "MATCH_RAD", "ROAD_USER_HEIGHT_M", "MovingClusters", "azimuth_equations_camera",
+    "azimuth_equations_lidar", "camera_azimuth_residuals", "camera_radar_cost", "lidar_azimuth_residuals",
     "moving_clusters",
-]
+]  # fmt: skip
 
 MATCH_RAD = np.radians(1.0)  # cluster to box: half a car at 40 m
 _GATE_M = 2.5  # lidar cluster centre to radar cluster centre: half a car, twice
@@ -136,9 +130,7 @@ def moving_clusters(observations: Sequence[Observation], with_boxes: bool = True
 
 
 def lidar_azimuth_residuals(
-    clusters: MovingClusters,
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    dt_s: float,
+    clusters: MovingClusters, T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
     """Azimuth of the nearest lidar cluster minus the radar cluster's, from the radar, and its Jacobian.
 
@@ -162,9 +154,7 @@ def lidar_azimuth_residuals(
 
 
 def camera_azimuth_residuals(
-    clusters: MovingClusters,
-    T_camera_radar: Float[np.ndarray, "4 4"],
-    gate_rad: float,
+    clusters: MovingClusters, T_camera_radar: Float[np.ndarray, "4 4"], gate_rad: float
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
     """Azimuth of each moving cluster minus that of the nearest box of fitting size, in the camera.
 
@@ -199,18 +189,14 @@ def _box_table(clusters: MovingClusters) -> tuple[Float[np.ndarray, "F M"], Floa
 
 
 def azimuth_equations_lidar(
-    clusters: MovingClusters,
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    dt_s: float,
+    clusters: MovingClusters, T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float
 ) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
     """Per frame, information and gradient of the robust azimuth cost of moving clusters against the lidar."""
     return robust_equations(*lidar_azimuth_residuals(clusters, T_lidar_radar, dt_s), clusters.observations)
 
 
 def azimuth_equations_camera(
-    clusters: MovingClusters,
-    T_camera_radar: Float[np.ndarray, "4 4"],
-    gate_rad: float,
+    clusters: MovingClusters, T_camera_radar: Float[np.ndarray, "4 4"], gate_rad: float
 ) -> tuple[Float[np.ndarray, "F 6 6"], Float[np.ndarray, "F 6"], float]:
     """The same against camera boxes; unknowns are the left twist of T_camera_radar."""
     return robust_equations(

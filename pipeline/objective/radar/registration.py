@@ -29,23 +29,10 @@ from pipeline.rig.se3 import inverse, transform_points
 from schemas.observations import Observation
 
 __all__ = [
-    "BOUNCE_PRIOR",
-    "RANGE_M",
-    "SIDE_RAD",
-    "SIGMA_START",
-    "STRAY",
-    "VIEW_MARGIN_RAD",
-    "NormalEquations",
-    "RegistrationFrames",
-    "equations_by_frame",
-    "normal_equations",
-    "registration_cost",
-    "registration_frames",
-    "robust_equations",
-    "rows_of_frames",
-    "spread_of",
-    "updated_sigma",
-]
+    "BOUNCE_PRIOR", "RANGE_M", "SIDE_RAD", "SIGMA_START", "STRAY", "VIEW_MARGIN_RAD", "NormalEquations",
+    "RegistrationFrames", "equations_by_frame", "normal_equations", "registration_cost",
+    "registration_frames", "robust_equations", "rows_of_frames", "spread_of", "updated_sigma",
+]  # fmt: skip
 
 # Starts and limits of (azimuth [rad], elevation [rad], range [m]): from car radars' data sheets, wide.
 SIGMA_START = np.array([np.radians(0.6), np.radians(2.2), 0.20])
@@ -149,25 +136,16 @@ def registration_frames(
         rows.append((plane, has_plane, o.radar_has_elevation, o.radar_velocity_mps, turn, gap_s, index))
     (radar_m, radar_first), (lidar_m, lidar_first) = _pack(radar), _pack(lidar)
     return RegistrationFrames(
-        radar_m,
-        radar_first,
-        lidar_m,
-        lidar_first,
-        **columns_of(rows, _FRAME),
+        radar_m, radar_first, lidar_m, lidar_first, **columns_of(rows, _FRAME),
         lidar_elevation_rad=_elevation_limits(observations),
-    )
+    )  # fmt: skip
 
 
 def normal_equations(
-    frames: RegistrationFrames,
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    dt_s: float,
-    sigma: Float[np.ndarray, " 3"],
-    bounce_prior: float = BOUNCE_PRIOR,
-    outlier: float = 1.0,
-    stride: int = 1,
+    frames: RegistrationFrames, T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float,
+    sigma: Float[np.ndarray, " 3"], bounce_prior: float = BOUNCE_PRIOR, outlier: float = 1.0, stride: int = 1,
     range_bias_m: float = 0.0,
-) -> NormalEquations:
+) -> NormalEquations:  # fmt: skip
     """Assign softly at this pose and linearise.
 
     Args:
@@ -183,25 +161,14 @@ def normal_equations(
     total = stats.sum(0)
     moments = total[4:7] / np.maximum([total[2], total[7], total[2]], 1e-9)
     return NormalEquations(
-        H,
-        g,
-        info,
-        -stats[:, 0] / seen,
-        stats[:, 2] / seen,
-        float(total[3] / max(total[2], 1e-9)),
-        moments,
+        H, g, info, -stats[:, 0] / seen, stats[:, 2] / seen, float(total[3] / max(total[2], 1e-9)), moments
     )
 
 
 def registration_cost(
-    frames: RegistrationFrames,
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    dt_s: float,
-    sigma: Float[np.ndarray, " 3"],
-    outlier: float = 1.0,
-    stride: int = 1,
-    range_bias_m: float = 0.0,
-) -> Float[np.ndarray, " F"]:
+    frames: RegistrationFrames, T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float,
+    sigma: Float[np.ndarray, " 3"], outlier: float = 1.0, stride: int = 1, range_bias_m: float = 0.0,
+) -> Float[np.ndarray, " F"]:  # fmt: skip
     """The cost of `normal_equations` alone, without ground bounces: half the work, to compare poses and offsets."""
     about = (frames, T_lidar_radar, dt_s, sigma, 0.0, outlier, stride, range_bias_m)
     stats = _accumulated(*about, with_equations=False)[-1]
@@ -209,46 +176,20 @@ def registration_cost(
 
 
 def _accumulated(
-    frames: RegistrationFrames,
-    T_lidar_radar: np.ndarray,
-    dt_s: float,
-    sigma: np.ndarray,
-    bounce_prior: float,
-    outlier: float,
-    stride: int,
-    range_bias_m: float,
-    *,
-    with_equations: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    frames: RegistrationFrames, T_lidar_radar: np.ndarray, dt_s: float, sigma: np.ndarray,
+    bounce_prior: float, outlier: float, stride: int, range_bias_m: float, *, with_equations: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """H (2 F 8 8), g (2 F 8), information (2 F 8 8) and statistics (F STATS) of the compiled loop."""
     F = frames.count
     H, info = np.zeros((F, 2, 8, 8)), np.zeros((F, 2, 8, 8))
     g, stats = np.zeros((F, 2, 8)), np.zeros((F, STATS))
     accumulate_frames(
-        np.ascontiguousarray(T_lidar_radar, np.float64),
-        frames.stamp_gap_s + dt_s,
-        range_bias_m,
-        frames.velocity_mps,
-        frames.yaw_rate_radps,
-        frames.radar_m,
-        frames.radar_first,
-        frames.lidar_m,
-        frames.lidar_first,
-        frames.plane,
-        frames.has_plane,
-        frames.has_elevation,
-        _comparable_elevations(frames.lidar_elevation_rad, float(sigma[1])),
-        np.asarray(sigma, np.float64),
-        outlier,
-        bounce_prior,
-        stride,
-        RANGE_M[1] + 5.0,
-        with_equations,
-        H,
-        g,
-        info,
-        stats,
-    )
+        np.ascontiguousarray(T_lidar_radar, np.float64), frames.stamp_gap_s + dt_s, range_bias_m,
+        frames.velocity_mps, frames.yaw_rate_radps, frames.radar_m, frames.radar_first, frames.lidar_m,
+        frames.lidar_first, frames.plane, frames.has_plane, frames.has_elevation,
+        _comparable_elevations(frames.lidar_elevation_rad, float(sigma[1])), np.asarray(sigma, np.float64),
+        outlier, bounce_prior, stride, RANGE_M[1] + 5.0, with_equations, H, g, info, stats,
+    )  # fmt: skip
     return H.swapaxes(0, 1), g.swapaxes(0, 1), info.swapaxes(0, 1), stats
 
 

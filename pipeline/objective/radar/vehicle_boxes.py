@@ -21,15 +21,9 @@ from pipeline.rig.se3 import camera_direction_angles, from_spherical, hat, to_sp
 from schemas.observations import Observation
 
 __all__ = [
-    "BOX_CLASSES",
-    "BoxPairs",
-    "VehicleBoxes",
-    "box_equations",
-    "box_pairs",
-    "elevation_residuals",
-    "median_of_rows",
-    "vehicle_boxes",
-]
+    "BOX_CLASSES", "BoxPairs", "VehicleBoxes", "box_equations", "box_pairs", "elevation_residuals",
+    "median_of_rows", "vehicle_boxes",
+]  # fmt: skip
 
 BOX_CLASSES = (("car",), ("truck", "bus"))
 _KIND_OF = {name: kind for kind, names in enumerate(BOX_CLASSES) for name in names}
@@ -176,11 +170,7 @@ def _is_occluded(boxes: np.ndarray, b: int) -> bool:
 
 
 def _detections_of(
-    angles: np.ndarray,
-    distance: np.ndarray,
-    boxes: VehicleBoxes,
-    b: int,
-    elevation_gate: float,
+    angles: np.ndarray, distance: np.ndarray, boxes: VehicleBoxes, b: int, elevation_gate: float
 ) -> np.ndarray:
     """Detections between the box's sides in the most populated range interval near the expected range."""
     expected_m = boxes.expected_m[b]

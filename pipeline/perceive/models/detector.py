@@ -96,13 +96,9 @@ class Detector:
 
 
 def decode_head(
-    output: np.ndarray,
-    layout: str,
-    input_size: tuple[int, int],
-    strides: tuple[int, ...],
-    manifest: str,
+    output: np.ndarray, layout: str, input_size: tuple[int, int], strides: tuple[int, ...], manifest: str,
     classes: int,
-) -> Candidates:
+) -> Candidates:  # fmt: skip
     """Boxes in input pixels, with the best class of each.
 
     Layouts: "yolox" 1 x A x (4+1+C), raw grid offsets and log sizes, objectness and classes already sigmoid;

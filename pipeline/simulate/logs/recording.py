@@ -35,16 +35,9 @@ from pipeline.simulate.world.casting import Moment, World
 from pipeline.simulate.world.drives import Drive, rotation
 
 __all__ = [
-    "FIRST_FRAME_S",
-    "PARTIAL",
-    "SUFFIXES",
-    "Sent",
-    "Ticks",
-    "free_clocks",
-    "messages_of",
-    "open_log",
+    "FIRST_FRAME_S", "PARTIAL", "SUFFIXES", "Sent", "Ticks", "free_clocks", "messages_of", "open_log",
     "record_drive",
-]
+]  # fmt: skip
 
 _ODOMETRY_HZ: Final = 20.0
 FIRST_FRAME_S: Final = 1.0  # the log of a drive starts this long before its first frame
@@ -81,13 +74,9 @@ class Ticks:
 
 
 def record_drive(
-    log: OpenLog,
-    world: World,
-    setups: Sequence[Setup],
-    rate_hz: float,
-    rng: np.random.Generator,
+    log: OpenLog, world: World, setups: Sequence[Setup], rate_hz: float, rng: np.random.Generator,
     tick: Callable[[int], None],
-) -> None:
+) -> None:  # fmt: skip
     """Write one drive to an open log; `setups` has the vehicle's state at each moment to write."""
     drive, messages, rig = world.drive, log.messages, setups[0].rig
 
@@ -125,15 +114,9 @@ def record_drive(
 
 
 def _images_before(
-    messages: RosMessages,
-    moment: Moment,
-    scene: Scene,
-    setup: Setup,
-    clocks: Mapping[str, Ticks],
-    stamps_s: Mapping[str, float],
-    rate_hz: float,
-    at: Callable[[float], int],
-) -> list[Sent]:
+    messages: RosMessages, moment: Moment, scene: Scene, setup: Setup, clocks: Mapping[str, Ticks],
+    stamps_s: Mapping[str, float], rate_hz: float, at: Callable[[float], int],
+) -> list[Sent]:  # fmt: skip
     """Of each camera the image at its own rate some metres before, where the last moment lies farther back.
 
     Its draws are its own: the moment's are those of a rig without such images.
@@ -283,13 +266,9 @@ def _plugged(sensor: SensorSpec, setup: Setup) -> SensorSpec:
 
 
 def _of_camera(
-    messages: RosMessages,
-    image: Image,
-    setup: Setup,
-    sensor: SensorSpec,
-    stamp: int,
+    messages: RosMessages, image: Image, setup: Setup, sensor: SensorSpec, stamp: int,
     rng: np.random.Generator,
-) -> list[Sent]:
+) -> list[Sent]:  # fmt: skip
     """An image with its intrinsics, labels and detections."""
     today, name = setup.faults, sensor.name
     labels = _permuted(image.labels_png, rng) if today.has("labels", name) else image.labels_png

@@ -51,13 +51,9 @@ class Sweep:
 
 
 def sweep_lidar(
-    moment: Moment,
-    ego: Motion,
-    T_vehicle_lidar: Float[np.ndarray, "4 4"],
-    spec: LidarSpec,
-    end_s: float,
+    moment: Moment, ego: Motion, T_vehicle_lidar: Float[np.ndarray, "4 4"], spec: LidarSpec, end_s: float,
     rng: np.random.Generator,
-) -> Sweep:
+) -> Sweep:  # fmt: skip
     """One sweep that ends at `end_s` of the drive."""
     angles, column_time = beams_of(spec, end_s), np.linspace(-spec.sweep_s, 0.0, spec.columns)
     T = ego.poses(end_s + column_time) @ T_vehicle_lidar

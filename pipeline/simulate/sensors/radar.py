@@ -70,15 +70,10 @@ class _Cells:
 
 
 def scan_radar(
-    moment: Moment,
-    ego: Motion,
-    T_vehicle_radar: Float[np.ndarray, "4 4"],
-    spec: RadarSpec,
-    errors: RadarErrors,
-    rng: np.random.Generator,
-    mirrors_m: tuple[float, ...] = (),
+    moment: Moment, ego: Motion, T_vehicle_radar: Float[np.ndarray, "4 4"], spec: RadarSpec,
+    errors: RadarErrors, rng: np.random.Generator, mirrors_m: tuple[float, ...] = (),
     beacons_map: Float[np.ndarray, "N 3"] | None = None,
-) -> Scan:
+) -> Scan:  # fmt: skip
     """One scan at the time of the moment.
 
     Args:

@@ -111,17 +111,11 @@ _NO_LIDAR: Final = RigSpec(
 
 
 def _trio(
-    name: str,
-    camera: CameraSpec = _CAMERA,
-    lidar: LidarSpec = _LIDAR,
-    radar: RadarSpec = _RADAR,
-    *,
+    name: str, camera: CameraSpec = _CAMERA, lidar: LidarSpec = _LIDAR, radar: RadarSpec = _RADAR, *,
     xyz_m: tuple[Triple, Triple, Triple] = (_CAMERA_M, _LIDAR_M, (1.66, -0.22, 1.58)),
-    rpy_deg: tuple[Triple, Triple, Triple] = (_LEVEL,) * 3,
-    delay_s: tuple[float, float] = (0.012, -0.018),
-    free_hz: Triple | None = None,
-    **car: Any,
-) -> RigSpec:
+    rpy_deg: tuple[Triple, Triple, Triple] = (_LEVEL,) * 3, delay_s: tuple[float, float] = (0.012, -0.018),
+    free_hz: Triple | None = None, **car: Any,
+) -> RigSpec:  # fmt: skip
     """A rig of three sensors named camera, lidar and radar, in this order in the arguments; by default the demo's.
 
     `delay_s` is of camera and radar; `free_hz` None = the lidar triggers both; `**car` are fields of RigSpec.
@@ -184,8 +178,7 @@ _ALL: Final = (
     ),
     # 240,000 beams a second over 82 x 25 deg, as in Livox' Horizon; six lasers behind the same prisms.
     _trio(
-        "rosette",
-        lidar=LidarSpec((-41.0, 41.0), (-14.5, 10.5), 4000, 6, 0.1, 1.0, 100.0, pattern="rosette"),
+        "rosette", lidar=LidarSpec((-41.0, 41.0), (-14.5, 10.5), 4000, 6, 0.1, 1.0, 100.0, pattern="rosette")
     ),
     _trio("fisheye", camera=CameraSpec(1280, 960, 190.0, 142.5), lidar=_SPINNING),
     _trio(
@@ -317,28 +310,19 @@ def _lidar(rng: np.random.Generator) -> LidarSpec:
     step = rng.uniform(0.2, 0.4)
     lowest, highest = rng.uniform(-25.0, -12.0), rng.uniform(3.0, 15.0)
     return LidarSpec(
-        (-side, side),
-        (lowest, highest),
-        columns=round(2 * side / step),
-        rows=rows,
-        sweep_s=float(rng.choice([0.05, 0.1])),
-        min_range_m=rng.uniform(0.8, 5.0),
-        max_range_m=rng.uniform(70.0, 120.0),
-        range_sigma_m=rng.uniform(0.01, 0.03),
+        (-side, side), (lowest, highest), columns=round(2 * side / step), rows=rows,
+        sweep_s=float(rng.choice([0.05, 0.1])), min_range_m=rng.uniform(0.8, 5.0),
+        max_range_m=rng.uniform(70.0, 120.0), range_sigma_m=rng.uniform(0.01, 0.03),
         divergence_deg=rng.uniform(0.05, 0.15),
-    )
+    )  # fmt: skip
 
 
 def _radar(rng: np.random.Generator) -> RadarSpec:
     return RadarSpec(
-        azimuth_deg=rng.uniform(28.0, 60.0),
-        elevation_deg=rng.uniform(8.0, 15.0),
-        min_range_m=rng.uniform(1.0, 5.0),
-        max_range_m=rng.uniform(70.0, 120.0),
-        azimuth_resolution_deg=rng.uniform(1.0, 3.0),
-        elevation_resolution_deg=rng.uniform(3.0, 9.0),
+        azimuth_deg=rng.uniform(28.0, 60.0), elevation_deg=rng.uniform(8.0, 15.0),
+        min_range_m=rng.uniform(1.0, 5.0), max_range_m=rng.uniform(70.0, 120.0),
+        azimuth_resolution_deg=rng.uniform(1.0, 3.0), elevation_resolution_deg=rng.uniform(3.0, 9.0),
         range_resolution_m=rng.uniform(0.2, 0.6),
         doppler_period_mps=float(rng.choice([10.4, 20.0, 40.0, 80.0])),
-        doppler_positive=str(rng.choice(["receding", "approaching"])),
-        rays=int(rng.integers(5000, 9000)),
-    )
+        doppler_positive=str(rng.choice(["receding", "approaching"])), rays=int(rng.integers(5000, 9000)),
+    )  # fmt: skip

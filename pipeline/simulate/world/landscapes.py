@@ -134,24 +134,14 @@ def _drawn(seed: int) -> Landscape:
     gardens = tuple((kind, float(w)) for (kind, _), w in zip(_GARDENS, weights, strict=True))
     lowest = rng.uniform(4.0, 45.0)
     drawn = replace(
-        base,
-        name=f"{WORLD}{seed}",
-        plain=False,
-        pace=base.pace * rng.uniform(0.7, 1.2),
-        parking=float(often(0.5)) if base.parking else 0.0,
-        traffic=base.traffic * rng.uniform(0.3, 1.3),
-        fences=gardens if base.houses else base.fences,
-        houses=base.houses * rng.uniform(0.4, 1.0),
-        green=base.green * rng.uniform(0.2, 2.0),
-        trees_m=rng.uniform(5.0, 16.0) if often(0.4) else 0.0,
+        base, name=f"{WORLD}{seed}", plain=False, pace=base.pace * rng.uniform(0.7, 1.2),
+        parking=float(often(0.5)) if base.parking else 0.0, traffic=base.traffic * rng.uniform(0.3, 1.3),
+        fences=gardens if base.houses else base.fences, houses=base.houses * rng.uniform(0.4, 1.0),
+        green=base.green * rng.uniform(0.2, 2.0), trees_m=rng.uniform(5.0, 16.0) if often(0.4) else 0.0,
         poles_m=rng.uniform(4.0, 50.0) if often(0.6) else 0.0,
-        surface=_SURFACES[int(rng.integers(len(_SURFACES)))],
-        markings=often(0.6),
-        infrared=often(0.6),
-        glass=often(0.7),
-        sun_deg=(lowest, lowest + 12.0),
-        side_light=often(0.5),
-    )
+        surface=_SURFACES[int(rng.integers(len(_SURFACES)))], markings=often(0.6), infrared=often(0.6),
+        glass=often(0.7), sun_deg=(lowest, lowest + 12.0), side_light=often(0.5),
+    )  # fmt: skip
     if base.name == "alley" or base.ceiling_m:
         drawn = replace(drawn, trees_m=0.0)
     return replace(drawn, surface="asphalt") if base.fast else drawn

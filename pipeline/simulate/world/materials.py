@@ -13,14 +13,7 @@ import numpy as np
 
 from pipeline.core.rigs import StreetClass
 
-__all__ = [
-    "LABELS",
-    "MATERIALS",
-    "TABLE",
-    "Material",
-    "MaterialTable",
-    "material",
-]
+__all__ = ["LABELS", "MATERIALS", "TABLE", "Material", "MaterialTable", "material"]
 
 LABELS: Final[tuple[str, ...]] = get_args(StreetClass)
 _PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN, _COBBLES, _WIRE = range(11)

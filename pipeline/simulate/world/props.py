@@ -11,20 +11,9 @@ import numpy as np
 from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number
 
 __all__ = [
-    "PANEL",
-    "SIGN_COLOURS",
-    "bollards",
-    "bush",
-    "delineator",
-    "farm",
-    "lamp",
-    "litter_bin",
-    "made_once",
-    "rail_post",
-    "sign",
-    "signal",
-    "tree",
-]
+    "PANEL", "SIGN_COLOURS", "bollards", "bush", "delineator", "farm", "lamp", "litter_bin", "made_once",
+    "rail_post", "sign", "signal", "tree",
+]  # fmt: skip
 
 SIGN_COLOURS: Final = (
     (1.0, 1.0, 1.0),

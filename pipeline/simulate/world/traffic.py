@@ -156,14 +156,9 @@ def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, flo
 
 
 def _actor(
-    drive: Drive,
-    key: int,
-    kind: str,
-    variant: int,
-    s_d_h: tuple[float, float, float],
-    speed_mps: float,
+    drive: Drive, key: int, kind: str, variant: int, s_d_h: tuple[float, float, float], speed_mps: float,
     yaw_rad: float = 0.0,
-) -> Actor:
+) -> Actor:  # fmt: skip
     """A road user at a place of the road; negative speed = oncoming."""
     before, after = drive.road.to_map(np.array(s_d_h) + [[-0.5, 0, 0], [0.5, 0, 0]])
     return Actor(key, kind, variant, drive.road.pose(*s_d_h, yaw_rad), speed_mps * (after - before))

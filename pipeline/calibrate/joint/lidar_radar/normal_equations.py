@@ -47,16 +47,9 @@ from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD
 from pipeline.rig.se3 import change_between, change_jacobian
 
 __all__ = [
-    "add_elevations",
-    "add_heights",
-    "add_travel",
-    "elevation_equations",
-    "height_equations",
-    "linearise",
-    "planar_gradient",
-    "travel_equations",
-    "turned",
-]
+    "add_elevations", "add_heights", "add_travel", "elevation_equations", "height_equations", "linearise",
+    "planar_gradient", "travel_equations", "turned",
+]  # fmt: skip
 
 
 def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: int = 1) -> Linear:
@@ -73,16 +66,9 @@ def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: in
     travel_scatter = add_travel(problem, state, sums)
     add_heights(problem, state, sums)
     return Linear(
-        sums.H,
-        sums.information,
-        sums.g,
-        *_prior_equations(problem, state),
-        equations,
-        mover_sigma,
-        travel_scatter,
-        sums.floors,
-        sums.floors - sums.of_day,
-    )
+        sums.H, sums.information, sums.g, *_prior_equations(problem, state), equations, mover_sigma,
+        travel_scatter, sums.floors, sums.floors - sums.of_day,
+    )  # fmt: skip
 
 
 def planar_gradient(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " A"]:
@@ -112,16 +98,10 @@ def _registration(
     equations = _about_radar(
         about_radar,
         normal_equations(
-            problem.frames,
-            state.T_lidar_radar,
-            state.dt_s,
-            state.sigma * widen,
-            state.bounce,
-            OUTLIER_DENSITY,
-            stride,
-            state.range_bias_m,
+            problem.frames, state.T_lidar_radar, state.dt_s, state.sigma * widen, state.bounce,
+            OUTLIER_DENSITY, stride, state.range_bias_m,
         ),
-    )
+    )  # fmt: skip
     if "static" in problem.terms:
         return equations
     return replace(equations, H=0 * equations.H, g=0 * equations.g, information=0 * equations.information)
@@ -286,17 +266,10 @@ def _floor(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " 3"]:
 
 
 def _add_tilts(
-    problem: RadarProblem,
-    state: RadarState,
-    name: str,
-    columns: Int64[np.ndarray, " C"],
-    H: Float[np.ndarray, "F C C"],
-    g: Float[np.ndarray, "F C"],
-    floor: Float[np.ndarray, "C C"],
-    sums: Sums,
-    information: Float[np.ndarray, "F C C"] | None = None,
-    of_day: Float[np.ndarray, "C C"] | None = None,
-) -> None:
+    problem: RadarProblem, state: RadarState, name: str, columns: Int64[np.ndarray, " C"],
+    H: Float[np.ndarray, "F C C"], g: Float[np.ndarray, "F C"], floor: Float[np.ndarray, "C C"], sums: Sums,
+    information: Float[np.ndarray, "F C C"] | None = None, of_day: Float[np.ndarray, "C C"] | None = None,
+) -> None:  # fmt: skip
     """Add a source's rotations about x and y, and its other unknowns, as a measurement with covariance `H^-1 + floor`.
 
     Detections measured too low rotate it upwards by their share (`seen_low`).

@@ -25,21 +25,9 @@ from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 from schemas.observations import Observation
 
 __all__ = [
-    "AZIMUTH_RANGE_DOF",
-    "DT",
-    "ELEVATION_DOF",
-    "RANGE",
-    "SCHEDULE",
-    "SEEN_LOW",
-    "STEP_LIMIT",
-    "UNKNOWNS",
-    "UNUSED",
-    "Linear",
-    "RadarProblem",
-    "RadarState",
-    "Schedule",
-    "Sums",
-]
+    "AZIMUTH_RANGE_DOF", "DT", "ELEVATION_DOF", "RANGE", "SCHEDULE", "SEEN_LOW", "STEP_LIMIT", "UNKNOWNS",
+    "UNUSED", "Linear", "RadarProblem", "RadarState", "Schedule", "Sums",
+]  # fmt: skip
 
 DT, RANGE = 6, 7
 # Two constants of vehicle boxes, which no term knows any more. Without them resampling would draw other numbers, and
