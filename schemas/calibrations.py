@@ -10,18 +10,9 @@ import numpy as np
 from schemas.columns import FAULTS_DOC, OBSERVABILITY_DOC, STATUS_DOC, Posed, TableSchema, array, column, row
 
 __all__ = [
-    "ASKS_FOR_FRAMES",
-    "CALIBRATIONS",
-    "DOF_NAMES",
-    "FRAMES_OF_PAIR",
-    "METHODS",
-    "PAIRS",
-    "PROBE_Z",
-    "SENSORS",
-    "STATUSES",
-    "CalibrationRecord",
-    "pairs_of",
-]
+    "ASKS_FOR_FRAMES", "CALIBRATIONS", "DOF_NAMES", "FRAMES_OF_PAIR", "METHODS", "PAIRS", "PROBE_Z",
+    "SENSORS", "STATUSES", "CalibrationRecord", "pairs_of",
+]  # fmt: skip
 
 SENSORS = ("camera", "lidar", "radar")
 FRAMES_OF_PAIR = {f"{parent}_{child}": (parent, child) for parent, child in combinations(SENSORS, 2)}

@@ -11,19 +11,9 @@ from schemas.columns import TableSchema, array, column, per_point, row
 from schemas.image_motion import EarlierColumns
 
 __all__ = [
-    "CAPTURES",
-    "IMAGES",
-    "SCANS",
-    "SWEEPS",
-    "CameraColumns",
-    "Capture",
-    "Image",
-    "ImageColumns",
-    "Scan",
-    "ScanColumns",
-    "Sweep",
-    "SweepColumns",
-]
+    "CAPTURES", "IMAGES", "SCANS", "SWEEPS", "CameraColumns", "Capture", "Image", "ImageColumns", "Scan",
+    "ScanColumns", "Sweep", "SweepColumns",
+]  # fmt: skip
 
 
 @row()

@@ -20,20 +20,9 @@ import pyarrow as pa
 from schemas.words import RECORD_WORDS, listed
 
 __all__ = [
-    "FAULTS_DOC",
-    "OBSERVABILITY_DOC",
-    "POSE_COLUMNS",
-    "STATUS_DOC",
-    "Column",
-    "Posed",
-    "Recorded",
-    "TableSchema",
-    "array",
-    "column",
-    "per_point",
-    "points",
-    "row",
-]
+    "FAULTS_DOC", "OBSERVABILITY_DOC", "POSE_COLUMNS", "STATUS_DOC", "Column", "Posed", "Recorded",
+    "TableSchema", "array", "column", "per_point", "points", "row",
+]  # fmt: skip
 
 # Columns of a pose T_a_b; where a row has several, each has a prefix (prior_qw, ego_tx_m).
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")

@@ -13,14 +13,7 @@ from shlex import quote
 from schemas.columns import Recorded, TableSchema, column, row
 from schemas.words import NEXT_STEPS, VEHICLE_WORDS, listed
 
-__all__ = [
-    "DRIFT",
-    "DRIFT_STATUSES",
-    "DriftFinding",
-    "VehicleStatus",
-    "next_step",
-    "status_of",
-]
+__all__ = ["DRIFT", "DRIFT_STATUSES", "DriftFinding", "VehicleStatus", "next_step", "status_of"]
 
 # Most urgent first; lists of vehicles are in this order.
 DRIFT_STATUSES = tuple(VEHICLE_WORDS)

@@ -14,17 +14,9 @@ from schemas.columns import TableSchema, array, column, per_point, points, row
 from schemas.image_motion import MotionColumns
 
 __all__ = [
-    "FEATURES",
-    "IMAGE_FEATURES",
-    "SCAN_FEATURES",
-    "SWEEP_FEATURES",
-    "ImageFeatureColumns",
-    "ImageFeatures",
-    "ScanFeatureColumns",
-    "ScanFeatures",
-    "SweepFeatureColumns",
-    "SweepFeatures",
-]
+    "FEATURES", "IMAGE_FEATURES", "SCAN_FEATURES", "SWEEP_FEATURES", "ImageFeatureColumns", "ImageFeatures",
+    "ScanFeatureColumns", "ScanFeatures", "SweepFeatureColumns", "SweepFeatures",
+]  # fmt: skip
 
 
 @row()

@@ -7,21 +7,9 @@ from typing import Final
 from schemas.columns import TableSchema, column, row
 
 __all__ = [
-    "FILES",
-    "MOMENTS",
-    "PERCEIVED",
-    "PRIOR",
-    "SAME_SCENE_NS",
-    "SENSORS_ABSENT",
-    "STATED_FAULTS",
-    "SWEEPS_LOGGED",
-    "SWEEPS_PLANNED",
-    "SWEEPS_READ",
-    "TF",
-    "EgoColumns",
-    "Moment",
-    "Perceived",
-]
+    "FILES", "MOMENTS", "PERCEIVED", "PRIOR", "SAME_SCENE_NS", "SENSORS_ABSENT", "STATED_FAULTS",
+    "SWEEPS_LOGGED", "SWEEPS_PLANNED", "SWEEPS_READ", "TF", "EgoColumns", "Moment", "Perceived",
+]  # fmt: skip
 
 # Key in the manifest's `kept`, for a day that was read in bursts: number of sweeps in the logs by their
 # indices, of sweeps covered by the plan, and of sweeps read.

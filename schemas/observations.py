@@ -7,15 +7,9 @@ from schemas.features import ImageFeatureColumns, ScanFeatureColumns, SweepFeatu
 from schemas.frames import Seen
 
 __all__ = [
-    "EDGE_ABOVE",
-    "EDGE_BELOW",
-    "EDGE_LEFT",
-    "EDGE_RIGHT",
-    "STEP_BELOW",
-    "STEP_RIGHT",
-    "WITHOUT_LABELS",
+    "EDGE_ABOVE", "EDGE_BELOW", "EDGE_LEFT", "EDGE_RIGHT", "STEP_BELOW", "STEP_RIGHT", "WITHOUT_LABELS",
     "Observation",
-]
+]  # fmt: skip
 
 # Direction class of a depth jump or mask boundary as seen in the image: the side of the boundary on which the
 # FOREGROUND lies (the nearer surface, or the object's mask). Only jumps and boundaries of the same class

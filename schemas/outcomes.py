@@ -36,10 +36,6 @@ class OutcomeRow(Recorded):
 
 
 OUTCOMES = TableSchema(
-    OutcomeRow,
-    "outcomes",
-    4,
-    "Stages that were up to date add no row.",
-    made_by="nightly",
+    OutcomeRow, "outcomes", 4, "Stages that were up to date add no row.", made_by="nightly",
     about=("vehicle", "day", "stage", "method"),
-)
+)  # fmt: skip

@@ -78,10 +78,6 @@ class StateRow(Posed):
 
 
 STATES = TableSchema(
-    StateRow,
-    "states",
-    7,
-    "boresight state prints the latest rows.",
-    made_by="state",
+    StateRow, "states", 7, "boresight state prints the latest rows.", made_by="state",
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
-)
+)  # fmt: skip

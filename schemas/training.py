@@ -20,17 +20,9 @@ import numpy as np
 from schemas.columns import TableSchema, array, column, per_point, points, row
 
 __all__ = [
-    "CLASS_OF_LABEL",
-    "GRID_CLASSES",
-    "NO_EDGE",
-    "POINT_IS_EDGE",
-    "POINT_IS_GROUND",
-    "SAMPLED",
-    "SPLITS",
-    "TRAINING",
-    "UNKNOWN_CLASS",
-    "TrainingRow",
-]
+    "CLASS_OF_LABEL", "GRID_CLASSES", "NO_EDGE", "POINT_IS_EDGE", "POINT_IS_GROUND", "SAMPLED", "SPLITS",
+    "TRAINING", "UNKNOWN_CLASS", "TrainingRow",
+]  # fmt: skip
 
 SPLITS = ("train", "val", "test")
 # Key in the manifest's `extra`: names of the camera, lidar and radar of the samples, by kind.

@@ -159,17 +159,11 @@ def _our_row(table: str, method: str, environment: str, members: Sequence[Compar
     loops = [c.independent_loop for c in members if c.independent_loop is not None]
     shifts = [shift for _, shift in loops if shift is not None]
     return TableRow(
-        table,
-        method,
-        environment,
-        "ours",
-        len(members),
-        _values([c.errors for c in members]),
-        accepted,
+        table, method, environment, "ours", len(members), _values([c.errors for c in members]), accepted,
         len(PAIRS) * len(members),
         float(np.degrees(np.mean([angle for angle, _ in loops]))) if loops else None,
         float(np.mean(shifts)) if shifts else None,
-    )
+    )  # fmt: skip
 
 
 def _loop_remarks(rows: Sequence[TableRow]) -> list[str]:

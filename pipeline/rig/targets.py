@@ -29,20 +29,10 @@ from pipeline.rig.se3 import (
 from schemas.calibrations import CalibrationRecord
 
 __all__ = [
-    "DEFAULT_TARGETS",
-    "ComparedRun",
-    "Comparison",
-    "PairDifference",
-    "PickUncertainty",
-    "Picks",
-    "error_sigma_at_picks",
-    "errors_at_targets",
-    "errors_of_picks",
-    "loop_error_sigma",
-    "loop_errors",
-    "target_jacobian",
-    "target_sigmas",
-]
+    "DEFAULT_TARGETS", "ComparedRun", "Comparison", "PairDifference", "PickUncertainty", "Picks",
+    "error_sigma_at_picks", "errors_at_targets", "errors_of_picks", "loop_error_sigma", "loop_errors",
+    "target_jacobian", "target_sigmas",
+]  # fmt: skip
 
 # Three reflectors in the shared field of view of sensors that look ahead: azimuth, elevation [rad], range
 # [m]. Records have other targets, visible to both of their sensors (`calibrate/verify/target_accuracy.py`).

@@ -121,13 +121,9 @@ class ClassMatcher(nn.Module):
         return torch.cat([member * near[:, None], member * (inside - near)[:, None]], 1)
 
     def _scores(
-        self,
-        table: Tensor,
-        level: _Level,
-        places: tuple[Tensor, Tensor],
-        probability: Tensor,
+        self, table: Tensor, level: _Level, places: tuple[Tensor, Tensor], probability: Tensor,
         groups: Tensor,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """B 12 S S: expected log-likelihood of each group at shifts of whole cells (rows down, columns right)."""
         # Lengths as plain numbers, not read off tensors: an exporter that traces would compute those in the graph.
         frames, pad = len(table), level.reach + 1

@@ -23,13 +23,9 @@ class Match:
 
 
 def damped_match(
-    J: Float[Tensor, "B N R 6"],
-    information: Float[Tensor, "B N R"],
-    gradient: Float[Tensor, "B N R"],
-    log_prior_sigma: Float[Tensor, " 6"],
-    R: Float[Tensor, "B 3 3"],
-    surfaces: Float[Tensor, "B S"],
-) -> Match:
+    J: Float[Tensor, "B N R 6"], information: Float[Tensor, "B N R"], gradient: Float[Tensor, "B N R"],
+    log_prior_sigma: Float[Tensor, " 6"], R: Float[Tensor, "B 3 3"], surfaces: Float[Tensor, "B S"],
+) -> Match:  # fmt: skip
     """One step of least squares behind a rotation R that the search has found.
 
     Args:

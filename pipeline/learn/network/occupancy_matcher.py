@@ -62,14 +62,10 @@ class OccupancyMatcher(nn.Module):
         return len(self.yaws) + len(self.pitches)
 
     def forward(
-        self,
-        radar_lidar: Float[Tensor, "B M 3"],
-        radar_features: Float[Tensor, "B M 3"],
-        radar_valid: Bool[Tensor, "B M"],
-        has_elevation: Bool[Tensor, " B"],
-        objects: Float[Tensor, "B L 3"],
+        self, radar_lidar: Float[Tensor, "B M 3"], radar_features: Float[Tensor, "B M 3"],
+        radar_valid: Bool[Tensor, "B M"], has_elevation: Bool[Tensor, " B"], objects: Float[Tensor, "B L 3"],
         object_weight: Float[Tensor, "B L"],
-    ) -> Match:
+    ) -> Match:  # fmt: skip
         """Find the turn (and shift) of the radar that fits best, in the lidar frame.
 
         Args:
@@ -103,14 +99,9 @@ class OccupancyMatcher(nn.Module):
         return self._finish(radar_lidar, exp_so3(omega), weight, tall, lidar, density, surfaces)
 
     def _profile(
-        self,
-        away: Tensor,
-        density: Tensor,
-        lidar_angle: Tensor,
-        radar_angle: Tensor,
-        shifts: Tensor,
+        self, away: Tensor, density: Tensor, lidar_angle: Tensor, radar_angle: Tensor, shifts: Tensor,
         axis: int,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """B M S: log-likelihood of each detection at each shift of one angle, `away` from the others (`_away`).
 
         The density is tabulated over absolute angles once (a matrix product) and looked up per detection.
@@ -154,15 +145,9 @@ class OccupancyMatcher(nn.Module):
         return torch.logsumexp(volume, 1), up, roll
 
     def _finish(
-        self,
-        radar_lidar: Tensor,
-        R: Tensor,
-        weight: Tensor,
-        tall: Tensor,
-        lidar: Tensor,
-        density: Tensor,
+        self, radar_lidar: Tensor, R: Tensor, weight: Tensor, tall: Tensor, lidar: Tensor, density: Tensor,
         surfaces: Tensor,
-    ) -> Match:
+    ) -> Match:  # fmt: skip
         """One step of damped least squares from a rotation R towards the softly associated lidar points."""
         radar_lidar, one = radar_lidar @ R.transpose(1, 2), torch.ones_like(tall)
         radar = _spherical(radar_lidar)

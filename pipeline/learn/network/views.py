@@ -79,16 +79,10 @@ def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
     camera = torch.cat([batch.image, batch.grid_seen[:, None] * 255], 1)
     return SensorInputs(
         crop(camera, batch.grid_step_deg, grid) / 255.0,
-        given_classes(crop(batch.grid_class, batch.grid_step_deg, grid)),
-        batch.lidar_xyz_m.float(),
-        batch.lidar_features,
-        batch.lidar_valid,
-        batch.radar_xyz_m.float(),
-        batch.radar_features,
-        batch.radar_valid,
-        batch.radar_has_elevation,
-        torch.ones(len(batch), device=batch.image.device),
-    )
+        given_classes(crop(batch.grid_class, batch.grid_step_deg, grid)), batch.lidar_xyz_m.float(),
+        batch.lidar_features, batch.lidar_valid, batch.radar_xyz_m.float(), batch.radar_features,
+        batch.radar_valid, batch.radar_has_elevation, torch.ones(len(batch), device=batch.image.device),
+    )  # fmt: skip
 
 
 def given_classes(grid_class: UInt8[Tensor, "B H W"]) -> Float[Tensor, "B C H W"]:

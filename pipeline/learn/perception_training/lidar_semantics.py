@@ -46,21 +46,9 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 
 __all__ = [
-    "GROUND",
-    "KINDS",
-    "KIND_OF_LABEL",
-    "LABELS",
-    "UNLABELLED",
-    "LidarSemantics",
-    "SweepImages",
-    "SweepLayout",
-    "SweepTraining",
-    "cut",
-    "day_images",
-    "hidden_points",
-    "project_labels",
-    "standing_points",
-]
+    "GROUND", "KINDS", "KIND_OF_LABEL", "LABELS", "UNLABELLED", "LidarSemantics", "SweepImages",
+    "SweepLayout", "SweepTraining", "cut", "day_images", "hidden_points", "project_labels", "standing_points",
+]  # fmt: skip
 
 UNLABELLED = 0
 # In the order of semantic-kitti.yaml's learning_map_inv.
@@ -89,9 +77,7 @@ _TABLE[: len(_OF_CITYSCAPES)] = [LABELS.index(name) for name in _OF_CITYSCAPES]
 
 
 def project_labels(
-    observation: Observation,
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    xyz_m: Float32[np.ndarray, "N 3"],
+    observation: Observation, T_camera_lidar: Float[np.ndarray, "4 4"], xyz_m: Float32[np.ndarray, "N 3"]
 ) -> UInt8[np.ndarray, " N"]:
     """Label of each point of the sweep (finite points, lidar frame); UNLABELLED if the camera shows none."""
     image = labels_of(observation)

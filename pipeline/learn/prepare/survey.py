@@ -70,16 +70,11 @@ def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Surve
         for d in np.unique(drive)
     }
     return Survey(
-        partition,
-        stamp,
-        drive,
-        np.array([i in perceived for i in light["moment"]], bool),
+        partition, stamp, drive, np.array([i in perceived for i in light["moment"]], bool),
         _moved(stamp, drive, np.nan_to_num(speed, nan=np.inf), config.min_step_m),
-        _places(partition, light["log"], drive, stamp, x, y, config),
-        x,
-        y,
+        _places(partition, light["log"], drive, stamp, x, y, config), x, y,
         [environments[int(d)] for d in drive],
-    )
+    )  # fmt: skip
 
 
 def plan_days(
@@ -118,14 +113,9 @@ def _moved(stamp: np.ndarray, drive: np.ndarray, speed: np.ndarray, step_m: floa
 
 
 def _places(
-    partition: Partition,
-    log: Sequence[str],
-    drive: np.ndarray,
-    stamp: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    config: PrepareConfig,
-) -> list[str]:
+    partition: Partition, log: Sequence[str], drive: np.ndarray, stamp: np.ndarray, x: np.ndarray,
+    y: np.ndarray, config: PrepareConfig,
+) -> list[str]:  # fmt: skip
     """A cell of the map, a cell of the log's own odometry, or a stretch of the drive."""
     begin = {int(d): float(stamp[drive == d].min()) for d in np.unique(drive)}
     names = []

@@ -47,13 +47,9 @@ class Passes(nn.Module):
 
 
 def batch_loss(
-    passes: nn.Module,
-    batch: TrainingBatch,
-    config: TrainConfig,
-    generator: torch.Generator,
-    *,
+    passes: nn.Module, batch: TrainingBatch, config: TrainConfig, generator: torch.Generator, *,
     paper: PaperFrames | None = None,
-) -> dict[str, Tensor]:
+) -> dict[str, Tensor]:  # fmt: skip
     """The `loss` of one batch from random guesses, differentiable, and means to report, of the last pass.
 
     Args:
@@ -134,11 +130,7 @@ def _semantics(answers: list[Predictions], view: TrainingBatch, turned: Tensor, 
 
 
 def _evidence(
-    answers: list[Predictions],
-    batch: TrainingBatch,
-    turned: Tensor,
-    grid: Grid,
-    generator: torch.Generator,
+    answers: list[Predictions], batch: TrainingBatch, turned: Tensor, grid: Grid, generator: torch.Generator
 ) -> Tensor:
     """Loss of the passes' evidence at the day's reference; 0 for networks without any."""
     total, T = torch.zeros((), device=batch.T_camera_lidar.device), turned @ batch.T_camera_lidar

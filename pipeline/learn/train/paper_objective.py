@@ -63,13 +63,9 @@ class PaperFrames:
         self._days: OrderedDict[Partition, dict[int, dict[str, PairLoss]]] = OrderedDict()
 
     def terms(
-        self,
-        batch: TrainingBatch,
-        T_camera_lidar: Float[Tensor, "B 4 4"],
-        T_camera_radar: Float[Tensor, "B 4 4"],
-        T_lidar_radar: Float[Tensor, "B 4 4"],
-        pairs: tuple[str, ...],
-    ) -> dict[str, Float[Tensor, " B"]]:
+        self, batch: TrainingBatch, T_camera_lidar: Float[Tensor, "B 4 4"],
+        T_camera_radar: Float[Tensor, "B 4 4"], T_lidar_radar: Float[Tensor, "B 4 4"], pairs: tuple[str, ...],
+    ) -> dict[str, Float[Tensor, " B"]]:  # fmt: skip
         """Losses of the pairs, and of the loop if `joint` is among them; their sum is the paper's L.
 
         Raises:

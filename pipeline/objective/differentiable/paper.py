@@ -31,15 +31,9 @@ from pipeline.objective.paper.classes import FoldedFrames
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss
 
 __all__ = [
-    "CameraRadarTensors",
-    "FoldedTensors",
-    "LidarRadarTensors",
-    "camera_radar_tensors",
-    "distance_cost",
-    "folded_tensors",
-    "lidar_radar_tensors",
-    "padded",
-]
+    "CameraRadarTensors", "FoldedTensors", "LidarRadarTensors", "camera_radar_tensors", "distance_cost",
+    "folded_tensors", "lidar_radar_tensors", "padded",
+]  # fmt: skip
 
 
 def distance_cost(squared: Float[Tensor, "*shape"], scale: float | Tensor) -> Float[Tensor, "*shape"]:

@@ -24,20 +24,10 @@ from torch import Tensor
 from pipeline.rig.cameras import Camera
 
 __all__ = [
-    "CameraProjection",
-    "GridProjection",
-    "bilinear",
-    "camera_projection",
-    "euler_angles",
-    "exp_so3",
-    "inverse",
-    "loop_loss",
-    "masked_mean",
-    "nearest_pixel",
-    "pose",
-    "pose_of_euler_angles",
+    "CameraProjection", "GridProjection", "bilinear", "camera_projection", "euler_angles", "exp_so3",
+    "inverse", "loop_loss", "masked_mean", "nearest_pixel", "pose", "pose_of_euler_angles",
     "transform_points",
-]
+]  # fmt: skip
 
 # Below this squared angle the series to second order in t^2 are exact to float32; and sqrt has no gradient at zero.
 _SMALL_RAD2 = 1e-4
@@ -106,13 +96,9 @@ def euler_angles(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 3"]:
 
 
 def loop_loss(
-    T_camera_lidar: Float[Tensor, "*batch 4 4"],
-    T_lidar_radar: Float[Tensor, "*batch 4 4"],
-    T_camera_radar: Float[Tensor, "*batch 4 4"],
-    *,
-    angle_unit: float = 1.0,
-    metre_unit: float = 1.0,
-) -> Float[Tensor, "*batch"]:
+    T_camera_lidar: Float[Tensor, "*batch 4 4"], T_lidar_radar: Float[Tensor, "*batch 4 4"],
+    T_camera_radar: Float[Tensor, "*batch 4 4"], *, angle_unit: float = 1.0, metre_unit: float = 1.0,
+) -> Float[Tensor, "*batch"]:  # fmt: skip
     """l1 norm of Euler angles and translation of the loop T_camera_lidar T_lidar_radar T_camera_radar^-1.
 
     The units are factors [1/rad] and [1/m]; the paper names none, so 1 as in `pipeline.objective.paper.classes`.

@@ -47,14 +47,9 @@ class StaticFrames:
 
 
 def static_cost(
-    T_lidar_radar: Float[Tensor, "*batch #F 4 4"],
-    frames: StaticFrames,
-    *,
-    outlier: float = 1.0,
-    bounce_prior: float = BOUNCE_PRIOR,
-    detections: int = _DETECTIONS,
-    points: int = _POINTS,
-) -> Float[Tensor, "*batch F"]:
+    T_lidar_radar: Float[Tensor, "*batch #F 4 4"], frames: StaticFrames, *, outlier: float = 1.0,
+    bounce_prior: float = BOUNCE_PRIOR, detections: int = _DETECTIONS, points: int = _POINTS,
+) -> Float[Tensor, "*batch F"]:  # fmt: skip
     """Minus the mean log likelihood of a frame's static detections, each drawn from a lidar point or its mirror image.
 
     Args:

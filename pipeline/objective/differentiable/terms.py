@@ -29,14 +29,9 @@ from pipeline.objective.differentiable.projection import (
 from pipeline.objective.radar.registration import SIGMA_START
 
 __all__ = [
-    "GridMaps",
-    "RadarTracks",
-    "class_evidence_cost",
-    "edge_cost",
-    "edge_residuals_px",
-    "track_cluster_cost",
+    "GridMaps", "RadarTracks", "class_evidence_cost", "edge_cost", "edge_residuals_px", "track_cluster_cost",
     "track_detection_cost",
-]
+]  # fmt: skip
 
 DEG = 180.0 / torch.pi
 EDGE_CLAMP_DEG = 4.0  # evidence: convex to +-4 deg
@@ -101,14 +96,9 @@ def edge_cost(
 
 
 def edge_residuals_px(
-    offsets: Int8[Tensor, "F 4 H W"],
-    uv: Float[Tensor, "*batch F N 2"],
-    seen: Bool[Tensor, "*batch F N"],
-    side: Int64[Tensor, "F N"],
-    *,
-    step_px: float = 1.0,
-    shift_px: float = 0.5,
-) -> tuple[Float[Tensor, "*batch F N"], Bool[Tensor, "*batch F N"]]:
+    offsets: Int8[Tensor, "F 4 H W"], uv: Float[Tensor, "*batch F N 2"], seen: Bool[Tensor, "*batch F N"],
+    side: Int64[Tensor, "F N"], *, step_px: float = 1.0, shift_px: float = 0.5,
+) -> tuple[Float[Tensor, "*batch F N"], Bool[Tensor, "*batch F N"]]:  # fmt: skip
     """Signed distance along its own axis from each jump to the nearest boundary of its direction class.
 
     As in `pipeline.objective.camera_lidar.edges`, which gives the reasons.
@@ -131,13 +121,9 @@ def edge_residuals_px(
 
 
 def class_evidence_cost(
-    projection: GridProjection,
-    points_camera: Float[Tensor, "F N 3"],
-    maps: Float[Tensor, "F K H W"],
-    probability: Float[Tensor, "F N K"],
-    weight: Float[Tensor, "F N"],
-    generator: torch.Generator,
-) -> Float[Tensor, ""]:
+    projection: GridProjection, points_camera: Float[Tensor, "F N 3"], maps: Float[Tensor, "F K H W"],
+    probability: Float[Tensor, "F N K"], weight: Float[Tensor, "F N"], generator: torch.Generator,
+) -> Float[Tensor, ""]:  # fmt: skip
     """Negative log-probability of a reference pose, against poses to opposite sides of it; mean over frames.
 
     A day's fit sums over frames how well classified points lie on a camera's likelihoods. Where the sum of a frame
@@ -171,13 +157,9 @@ class RadarTracks:
     has_elevation: Bool[Tensor, " F"]  # whether the radar measures it; else azimuth and the plane count alone
 
     def nearest_cost(
-        self,
-        flat: Float[Tensor, "*batch F M G"],
-        upwards: Float[Tensor, "*batch F M G"],
-        target_present: Bool[Tensor, "F G"],
-        tau: float,
-        clamp: float,
-    ) -> Float[Tensor, "*batch F"]:
+        self, flat: Float[Tensor, "*batch F M G"], upwards: Float[Tensor, "*batch F M G"],
+        target_present: Bool[Tensor, "F G"], tau: float, clamp: float,
+    ) -> Float[Tensor, "*batch F"]:  # fmt: skip
         """Mean over the tracks of the soft minimum of clamped distances; 0 for a frame without tracks or targets.
 
         Args:

@@ -26,22 +26,10 @@ from pipeline.rig.se3 import inverse
 from schemas.observations import Observation
 
 __all__ = [
-    "REFLECTING",
-    "ROAD",
-    "SKY",
-    "FoldedFrames",
-    "camera_at_label_size",
-    "distance_cost",
-    "euler_angles",
-    "fold_frames",
-    "frame_costs",
-    "in_range",
-    "labels_of",
-    "loop_loss",
-    "loop_transform",
-    "safely_in_view",
+    "REFLECTING", "ROAD", "SKY", "FoldedFrames", "camera_at_label_size", "distance_cost", "euler_angles",
+    "fold_frames", "frame_costs", "in_range", "labels_of", "loop_loss", "loop_transform", "safely_in_view",
     "thin",
-]
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

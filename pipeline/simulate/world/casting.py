@@ -260,13 +260,9 @@ def _cast(
 
 
 def standing_of(
-    mesh: Mesh,
-    origin: np.ndarray,
-    sun: np.ndarray,
-    to_map: Callable[[np.ndarray], np.ndarray],
-    s_m: float,
+    mesh: Mesh, origin: np.ndarray, sun: np.ndarray, to_map: Callable[[np.ndarray], np.ndarray], s_m: float,
     shadows_behind_m: float = _SHADOWS_BEHIND_M,
-) -> Standing:
+) -> Standing:  # fmt: skip
     """A static world from a mesh in the map, with sunlight on the ground around an arc length."""
     local = replace(mesh, corners=mesh.corners - origin.astype(np.float32))
     scene, cell, half, s0 = _scene(local), 0.4, 22.0, s_m - shadows_behind_m

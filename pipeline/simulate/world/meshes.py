@@ -59,11 +59,7 @@ class MeshBuilder:
     _parts: list[Mesh] = field(default_factory=list)
 
     def quads(
-        self,
-        corners: np.ndarray,
-        name: str,
-        tint: Colour = _WHITE,
-        uv: np.ndarray | None = None,
+        self, corners: np.ndarray, name: str, tint: Colour = _WHITE, uv: np.ndarray | None = None
     ) -> None:
         """Add Q quads (Q 4 3); uv (Q 4 2) defaults to lengths along the first and the last edge."""
         c = np.asarray(corners, np.float32).reshape(-1, 4, 3)
@@ -109,13 +105,7 @@ class MeshBuilder:
         self.frustum((x - a, x + a, y - b, y + b, z - c), (x - a, x + a, y - b, y + b, z + c), name, tint)
 
     def tube(
-        self,
-        a: np.ndarray,
-        b: np.ndarray,
-        radius_m: float,
-        name: str,
-        sides: int = 6,
-        tint: Colour = _WHITE,
+        self, a: np.ndarray, b: np.ndarray, radius_m: float, name: str, sides: int = 6, tint: Colour = _WHITE
     ) -> None:
         """Add a closed tube from a to b."""
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
@@ -132,13 +122,9 @@ class MeshBuilder:
             self.quads(np.stack([c, rim[:-1], rim[1:], c], 1), name, tint)
 
     def blob(
-        self,
-        centre: np.ndarray,
-        radii: np.ndarray,
-        name: str,
-        rng: np.random.Generator,
+        self, centre: np.ndarray, radii: np.ndarray, name: str, rng: np.random.Generator,
         tint: Colour = _WHITE,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Add a lumpy ellipsoid: tree crown, bush, head."""
         lat, lon = np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 10)
         bump = 1 + 0.16 * rng.uniform(-1, 1, (len(lat), len(lon)))

@@ -24,16 +24,9 @@ from pipeline.simulate.world.props import (
 )
 
 __all__ = [
-    "add_asphalt",
-    "add_halls",
-    "add_house",
-    "add_motorway",
-    "add_parked",
-    "add_pavement",
-    "add_plots",
-    "add_rows",
-    "add_street",
-]
+    "add_asphalt", "add_halls", "add_house", "add_motorway", "add_parked", "add_pavement", "add_plots",
+    "add_rows", "add_street",
+]  # fmt: skip
 
 
 def add_street(c: Chunk) -> None:
