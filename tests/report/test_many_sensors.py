@@ -27,9 +27,8 @@ def lake(tmp_path_factory):
     folder = tmp_path_factory.mktemp("many")
     (folder / "fleet.toml").write_text(RIGS)
     lake, rng = Lake.at(folder / "lake"), np.random.default_rng(4)
-    commit_records(
-        lake, CALIBRATIONS, rig_records("van", 12, rng, motion=lambda d: {"left": TURN} if d > 6 else {})
-    )
+    van = rig_records("van", 12, rng, motion=lambda d: {"left": TURN} if d > 6 else {})
+    commit_records(lake, CALIBRATIONS, van)
     commit_records(lake, CALIBRATIONS, vehicle_records("car", 12, rng))
     fleet = load_fleet(folder / "fleet.toml")
     AUDIT.run(Task(fleet, lake, Window()))
@@ -42,9 +41,8 @@ def test_the_fleet_page_has_a_chart_of_every_edge_under_its_name(lake, tmp_path)
     assert set(TITLES) < set(index["pairs"])
     charts = index["charts"]["inside"]
     assert {index["pairs"][c[0]] for c in charts["van"]["charts"]} == set(TITLES)
-    assert {index["pairs"][c[0]] for c in charts["car"]["charts"]} == {
-        "camera-lidar", "camera-radar", "lidar-radar"
-    }  # fmt: skip
+    three = {"camera-lidar", "camera-radar", "lidar-radar"}
+    assert {index["pairs"][c[0]] for c in charts["car"]["charts"]} == three
     for k, *_, values, _sigmas in charts["van"]["charts"]:
         assert len(values) == 12
         assert charts["van"]["pairs"][k] == "a" * 12

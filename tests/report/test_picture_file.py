@@ -8,15 +8,14 @@ from pipeline.core.errors import ConfigError
 from pipeline.report.overlays import front_view, lidar_window
 from pipeline.report.pictures import between, write_picture
 from pipeline.rig.se3 import inverse, rotation_angle_rad
-from tests.report.test_pictures import GOOD, WIDTH, _scene, _turned
+from tests.report.test_pictures import GOOD, HEIGHT, WIDTH, _scene, _turned
 
 LABELS = ("prior", "calibrated")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_each_pair_turns_by_the_share_of_its_whole_turn(share):
-    before = _turned(4.0)
-    state = between(before, GOOD, share)
+    before, state = _turned(4.0), between(_turned(4.0), GOOD, share)
     for name in ("T_camera_lidar", "T_lidar_radar"):
         turned = np.degrees(rotation_angle_rad(getattr(state, name) @ inverse(getattr(before, name))))
         assert turned == pytest.approx(4.0 * share, abs=1e-6)
@@ -46,6 +45,7 @@ def test_a_still_is_the_page_s_front_view(tmp_path, suffix):
 def test_the_window_holds_what_the_lidar_sees():
     window = lidar_window(_scene(), GOOD)
     assert window.size_px[0] <= WIDTH
+    assert window.centre_px == pytest.approx((WIDTH / 2, HEIGHT / 2), abs=40)
     narrow = _scene()
     near = np.abs(narrow.frame.lidar_y_m) < 3.0
     for name in ("lidar_x_m", "lidar_y_m", "lidar_z_m"):

@@ -55,22 +55,18 @@ def stored(lake):
 
 def test_terminal_page_and_show_say_of_every_vehicle_what_the_table_says(lake, tmp_path, capsys):
     page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
-    in_table = dict(
-        re.findall(r'<tr><td><a href="#charts-\w+">(\w+)</a></td><td class="status (\w+)">', page)
-    )
+    line = r'<tr><td><a href="#charts-\w+">(\w+)</a></td><td class="status (\w+)">'
+    in_table = dict(re.findall(line, page))
     on_charts = dict(re.findall(r'id="charts-(\w+)".*?<span class="pill (\w+)">', page))
     rows = [f for own in stored(lake).values() for f in own]
-    on_terminal = {
-        (words := Text.from_markup(line).plain.split())[1]: words[0] for line in status_lines(rows)
-    }
+    told = [Text.from_markup(line).plain.split() for line in status_lines(rows)]
+    on_terminal = {words[1]: words[0] for words in told}
     assert show("drift", lake=str(lake.root), current=True, json=True) == 0
     shown = {r["vehicle"]: r["vehicle_status"] for r in json.loads(capsys.readouterr().out)}
     on_days = {}
     for vehicle in EXPECTED:
-        day = write_day_page(
-            lake, Partition(vehicle, "2026-03-02"), _config(), tmp_path / "day.html"
-        ).read_text()
-        on_days[vehicle] = re.search(r'<span class="pill (\w+)">\1</span>', day)[1]
+        day = write_day_page(lake, Partition(vehicle, "2026-03-02"), _config(), tmp_path / "day.html")
+        on_days[vehicle] = re.search(r'<span class="pill (\w+)">\1</span>', day.read_text())[1]
     for said in (in_table, on_charts, on_terminal, shown, on_days):
         assert said == EXPECTED
 
@@ -97,9 +93,8 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     assert main(shlex.split(command)[1:]) == 0
     assert "run `boresight audit`, or wait for the next night" in capsys.readouterr().out
     assert main(["status", "--lake", str(own.root), "--vehicle", "red"]) == 0
-    assert (
-        "repair of radar on 2026-03-06 is not audited yet: run `boresight audit`" in capsys.readouterr().out
-    )
+    told = "repair of radar on 2026-03-06 is not audited yet: run `boresight audit`"
+    assert told in capsys.readouterr().out
     assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew

@@ -89,10 +89,8 @@ def test_every_term_is_finite_with_a_finite_gradient_even_at_absurd_poses(few):
     objective = frame_objective(few)
     for size in (0.0, 0.1, 3.0):
         xi = (size * torch.randn(3, len(few), 6, generator=torch.Generator().manual_seed(0))).requires_grad_()
-        T = [
-            exp_se3(x) @ t
-            for x, t in zip(xi, (few.T_camera_lidar, few.T_camera_radar, few.T_lidar_radar), strict=True)
-        ]
+        given = few.T_camera_lidar, few.T_camera_radar, few.T_lidar_radar
+        T = [exp_se3(x) @ t for x, t in zip(xi, given, strict=True)]
         terms = objective.terms(*T)
         assert {"edges", "tracks_camera", "static", "tracks_lidar", "loop"} <= set(terms)
         total = weighted(terms, LossConfig())
@@ -119,9 +117,8 @@ def test_random_guesses_close_the_loop_and_stay_in_their_limits(few):
 
 
 def test_a_mirrored_frame_has_the_same_losses_and_classes_at_mirrored_poses(few):
-    some = {
-        name: torch.full((len(few),), 0.3) for name in ("ego_yaw_rate_radps", "camera_lag_s", "radar_lag_s")
-    }
+    names = "ego_yaw_rate_radps", "camera_lag_s", "radar_lag_s"
+    some = {name: torch.full((len(few),), 0.3) for name in names}
     few = replace(few, **some, ego_velocity_mps=torch.tensor([[9.0, 2.0, 0.0]] * len(few)))
     there = mirrored(few, torch.tensor([False, True] * 2))
     guess = random_guess(few, AugmentConfig(view_deg=0), torch.Generator().manual_seed(1))
@@ -168,15 +165,10 @@ def test_the_loss_of_a_variance_is_least_at_the_scatter_s_own():
 
 def test_points_are_carried_to_the_image_s_time_as_joint_carries_them(few):
     some = torch.rand(len(few), 1, generator=torch.Generator().manual_seed(0))
-    moving = {
-        "ego_velocity_mps": torch.tensor([12.0, -0.8, 0.0]) * some,
-        "ego_yaw_rate_radps": some[:, 0] - 0.5,
-    }
-    points, dt_s, gap_s = (
-        20 * torch.rand(len(few), 50, 3),
-        np.array([0.08]),
-        np.linspace(-0.02, 0.03, len(few)),
-    )
+    velocity = torch.tensor([12.0, -0.8, 0.0]) * some
+    moving = {"ego_velocity_mps": velocity, "ego_yaw_rate_radps": some[:, 0] - 0.5}
+    points, dt_s = 20 * torch.rand(len(few), 50, 3), np.array([0.08])
+    gap_s = np.linspace(-0.02, 0.03, len(few))
     lagged = at_lag(replace(few, **moving), points, torch.tensor(gap_s - dt_s).float())
     T, (v, turn) = few.T_camera_lidar[:1].double().numpy(), (m.double().numpy() for m in moving.values())
     R, t = (np.ascontiguousarray(part) for part in (T[:, :3, :3], T[:, :3, 3]))
