@@ -177,10 +177,9 @@ def test_every_format_of_a_state_reads_back_as_the_one_pose_of_each_sensor(
 @pytest.mark.parametrize("vehicle", ["car", "van"])
 def test_the_page_has_the_rows_of_the_state_and_copies_them_as_json(lake, fleet, tmp_path, capsys, vehicle):
     sensors, _, rows = states_of(capsys, lake, vehicle)
-    page = write_day_page(
-        Lake.existing(lake), Partition(vehicle, LAST), fleet, tmp_path / "d.html", pictures=False
-    )
-    text = page.read_text()
+    day = Partition(vehicle, LAST)
+    text = write_day_page(Lake.existing(lake), day, fleet, tmp_path / "d.html", pictures=False).read_text()
+    assert ("The rig from above" in text) == (vehicle == "van")  # of sensors that have names of their own
     [copied] = re.findall(r'<script type="application/json" id="json-state">(.*?)</script>', text)
     own = [{k: v for k, v in row.items() if k not in ("pose", "sigma")} for row in json.loads(copied)]
     assert own == [{k: v for k, v in row.items() if k != "signed_by"} for row in rows]
