@@ -38,6 +38,8 @@ REASONS = {
     "few scenes": "too few scenes: {used} frames show {scenes}, needs {needed}",
     "far position": "by this day alone the position is {shift:+.2f} +- {sigma:.2f} m off the prior ({axis}), whose "
     "sigma is {prior:g} m: measure the mounting",
+    "far camera": "by its motion {camera} is {deg:.1f} deg off the prior, beyond the search range; the search began "
+    "there",
     "far clock": "the stamps are apart by {shift:+.0f} ms, far beyond time_offset_sigma_s ({sigma:.0f} ms): "
     "synchronise the clocks, or raise time_offset_sigma_s",
     "other clock": "frames align far better with stamps moved by {shift:+.0f} ms, far beyond time_offset_sigma_s "

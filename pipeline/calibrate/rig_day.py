@@ -17,6 +17,7 @@ from jaxtyping import Float
 from pipeline.calibrate.adjust.rig import AdjustedRig
 from pipeline.calibrate.adjusted_day import Concluded, SolvedEdge, adjusted_rig, conclude
 from pipeline.calibrate.day import solve_day
+from pipeline.calibrate.edges.camera_base import elsewhere
 from pipeline.calibrate.edges.on_base import DaySources
 from pipeline.calibrate.edges.sweep_travel import with_travel
 from pipeline.calibrate.judging import EdgeJudging
@@ -30,12 +31,20 @@ from pipeline.core.results import Progress, silent
 from pipeline.objective.ego_motion import mean_heading, shown_heading
 from pipeline.rig.day_prior import no_prior, prior_of_three
 from pipeline.rig.estimates import Check, Prior, change_of
-from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor
+from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor, pose_columns
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
 from pipeline.rig.prior import Extrinsics, RigPrior
 from pipeline.rig.rig import Rig
-from pipeline.rig.se3 import change_between, change_covariance, change_jacobian, changed, inverse, log_se3
+from pipeline.rig.se3 import (
+    change_between,
+    change_covariance,
+    change_jacobian,
+    changed,
+    inverse,
+    log_se3,
+    rotation_angle_rad,
+)
 from pipeline.store.views import Chosen
 from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation
@@ -111,8 +120,11 @@ def calibrate_rig(
     if not method_named(about.method).of_three:
         graph, known = with_travel(day.graph, day.prior, day.rows)
         day = replace(day, graph=graph, prior=known)
-    measured = day.rig.road_z_m, day.rig.measured_heights
-    sources = DaySources(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
+    logged, measured = day.prior, (day.rig.road_z_m, day.rig.measured_heights)
+    sources = DaySources(logged, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
+    begun, far = (logged, {}) if method_named(about.method).of_three else _begun(day, sources, fleet)
+    if far:
+        day, sources = replace(day, prior=begun), replace(sources, prior=begun)
     found, done = _Found(), 0
     groups = sorted(_groups(day.graph), key=lambda g: KIND_OF_EDGE[g[0].kind].order)
     inner = progress if len(groups) == 1 else silent
@@ -126,16 +138,44 @@ def calibrate_rig(
         else:
             _solve_other(day, fleet, about, sources, group[0], found)
     progress(done, done + 1, "adjust the rig")
-    edges, rig = _adjusted(day, fleet, about, found.edges)
+    against_prior = {e: [far[s.name] for s in e.edge.sensors if s.name in far] for e in found.edges}
+    solved = [e.with_checks(checks) if checks else e for e, checks in against_prior.items()]
+    edges, rig = _adjusted(day, fleet, about, solved)
     wrong = [] if rig is None else wrong_priors(edges, rig, fleet.verify.checks)
     concluded = conclude(edges, rig, lambda edge: _against(edge, rig, wrong))
     order = {(e.parent.name, e.child.name): k for k, e in enumerate(asked)}
     records = [*found.refused, *(c.record for c in concluded)]
     records = [r for r in records if (r.parent_frame, r.child_frame) in order]
     records.sort(key=lambda r: order[r.parent_frame, r.child_frame])
+    records = [
+        replace(r, **pose_columns(logged.between(r.parent_frame, r.child_frame), "prior_"))
+        if far.keys() & {r.parent_frame, r.child_frame}
+        else r
+        for r in records
+    ]
     middle = day.graph.reference
     to_middle = {c.edge.other(middle.name).name: c for c in concluded if middle in c.edge.sensors}
     return CalibratedRig(records, rig, to_middle, wrong)
+
+
+def _begun(day: RigDay, sources: DaySources, fleet: FleetConfig) -> tuple[RigPrior, dict[str, Check]]:
+    """Where the searches begin: the prior, but cameras beyond the search range of theirs where their motion shows them.
+
+    Also the check that such a camera's edges fail, by its name: the prior stays the day's, and contradicts them.
+    """
+    prior, T, checks = day.prior, day.prior.T, dict[str, Check]()
+    for edge in (e for e in day.graph.edges if e.kind == "camera_base"):
+        name = edge.parent.name
+        reach_rad = fleet.solve.search_range(prior.sigmas[name]).rotation_rad
+        reach_rad = max(reach_rad, prior.sigmas[BASE.name][0] if prior.is_base_loose else 0.0)
+        if (found := elsewhere(edge, sources, reach_rad)) is None:
+            continue
+        turn = inverse(sources.on_base(name)) @ found
+        back = inverse(turn)
+        T = {(a, b): back @ X if a == name else X @ turn if b == name else X for (a, b), X in T.items()}
+        deg = float(np.degrees(rotation_angle_rad(turn)))
+        checks[name] = Check(because("far camera", camera=name, deg=deg), _FAULT)
+    return replace(prior, T=T), checks
 
 
 def _against(edge: Edge, rig: AdjustedRig | None, wrong: Sequence[WrongPrior]) -> list[Check]:

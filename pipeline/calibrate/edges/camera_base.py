@@ -35,10 +35,10 @@ from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.estimates import Check, EdgeEvidence
 from pipeline.rig.graph import Edge
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3
 from schemas.observations import Observation
 
-__all__ = ["FEWEST", "CameraTravel", "camera_travel", "estimate_camera_base", "solve"]
+__all__ = ["FEWEST", "CameraTravel", "camera_travel", "elsewhere", "estimate_camera_base", "solve"]
 
 # A body pitches and yaws so much from image to image, however sharp the tracks are.
 _LEAST_RAD = np.radians(0.1)
@@ -65,20 +65,58 @@ _CLOCK_FLOOR_S, _MOST_CLOCK_S, _NO_CLOCK_S = 0.002, 0.025, 1.0
 FEWEST = 8
 _BY_WAY = ("yaw", "pitch")
 _PASSES = 4
+# Of a start for a search: from 120 deg off four rounds arrive. Half a turn may be a mirrored image.
+_ROUNDS, _SURE_SIGMAS, _OPEN, _MIRRORED_RAD = 4, 3.0, 0.1, np.radians(150.0)
 
 
 def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     """Evidence of a day, and its number of moments; raises SolveError if there are too few."""
+    travel, moments = _travel(edge, sources)
+    T, by_turns = sources.on_base(edge.parent.name), not sources.prior.is_base_loose
+    return estimate_camera_base(edge, travel, T, by_turns=by_turns), moments
+
+
+def elsewhere(edge: Edge, sources: DaySources, reach_rad: float) -> Float[np.ndarray, "4 4"] | None:
+    """T_base_camera by motion alone, if its prior is surely more than `reach_rad` off about an axis.
+
+    A search begins there: it is no measurement, since bodies lean in the turns that take part. What the day does not
+    determine, as roll on straight roads, stays at the prior. None if the prior is near, or few images show a motion.
+    """
+    try:
+        prior, (travel, _) = sources.on_base(edge.parent.name), _travel(edge, sources)
+        found = estimate_camera_base(edge, travel, prior)
+        if not _is_farther(found, prior, reach_rad, sigmas=0.0):
+            return None
+        for _ in range(_ROUNDS):
+            found = estimate_camera_base(edge, travel, inverse(found.T))
+    except SolveError:
+        return None
+    is_sure = not found.checks and _is_farther(found, prior, reach_rad, _SURE_SIGMAS)
+    return inverse(found.T) if is_sure else None
+
+
+def _is_farther(found: EdgeEvidence, T_base_camera: np.ndarray, reach_rad: float, sigmas: float) -> bool:
+    turn = log_so3(found.T[:3, :3] @ T_base_camera[:3, :3])
+    information, axes = np.linalg.eigh(found.information[:3, :3])
+    sigma = 1 / np.sqrt(np.maximum(information, _OPEN))
+    beyond = np.abs(turn @ axes) > reach_rad + sigmas * sigma
+    return bool(beyond.any() and np.linalg.norm(turn) < _MIRRORED_RAD)
+
+
+def _travel(edge: Edge, sources: DaySources) -> tuple[CameraTravel, int]:
+    """Motion of the camera and the base, and the number of the camera's moments; SolveError if it is silent."""
     name = edge.parent.name
-    T = sources.on_base(name)
-    rows = sources.rows({"camera": name})
-    if not rows:
-        raise SolveError(because("silent", sensor=name, what="image"), "silent_sensor")
-    travel, is_loose = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows)), sources.prior.is_base_loose
-    if is_loose and not any(o.ego_turned_rad is not None for o in rows):
-        unknown = travel.turned_rad * np.nan  # Doppler's yaw rate: by a lever that nobody measured
-        travel = replace(travel, turned_rad=unknown, turned_by_clock_radps=unknown)
-    return estimate_camera_base(edge, travel, T, by_turns=not is_loose), len(rows)
+    if name not in sources.read:
+        rows = sources.rows({"camera": name})
+        if not rows:
+            raise SolveError(because("silent", sensor=name, what="image"), "silent_sensor")
+        travel = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows))
+        if sources.prior.is_base_loose and not any(o.ego_turned_rad is not None for o in rows):
+            unknown = travel.turned_rad * np.nan  # Doppler's yaw rate: by a lever that nobody measured
+            travel = replace(travel, turned_rad=unknown, turned_by_clock_radps=unknown)
+        sources.read[name] = travel, len(rows)
+    known: tuple[CameraTravel, int] = sources.read[name]
+    return known
 
 
 def estimate_camera_base(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -47,6 +48,7 @@ class DaySources:
     Args:
         road_z_m: where the road lies in axes of the base.
         heights: of lidars over the road by name, as somebody measured them, with sigmas [m].
+        read: what a solver read already and needs again, by sensor.
     """
 
     prior: RigPrior
@@ -55,6 +57,7 @@ class DaySources:
     rows: Callable[[Chosen], list[Observation]]
     road_z_m: float = 0.0
     heights: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    read: dict[str, Any] = field(default_factory=dict)
 
     def sweeps(self, lidar: str) -> list[Observation]:
         """Moments of a lidar; raises SolveError if it is silent."""

@@ -213,7 +213,7 @@ def _sigmas_m(information: np.ndarray, way_m: float) -> tuple[float, float]:
 _NEAR_M, _FEWEST_POINTS = 15.0, 60  # of a sweep's ground that shows where the road is
 _BEHIND_M = 1.5  # the rear axle, behind lidars on the roof (1 m) and at the nose (4 m)
 # Of the frame before the day [rad, m]: so loose that only edges place it.
-_SIGMAS = (float(np.radians(20.0)), 3.0)
+_SIGMAS, _ANY_WAY_RAD = (float(np.radians(20.0)), 3.0), np.pi  # no radar may show where its x axis points
 
 
 def with_travel(
@@ -240,7 +240,8 @@ def with_travel(
         return graph, prior
     edges = (*graph.edges, *(edge_between(s, BASE) for s in graph.sensors if s not in prior.untied))
     known = {**prior.T, (reference, BASE.name): T @ T_lidar_base}
-    nodes, sigmas = (*prior.nodes, BASE), {**prior.sigmas, BASE.name: _SIGMAS}
+    of_base = _SIGMAS if headings else (_ANY_WAY_RAD, _SIGMAS[1])
+    nodes, sigmas = (*prior.nodes, BASE), {**prior.sigmas, BASE.name: of_base}
     prior = replace(prior, nodes=nodes, T=known, sigmas=sigmas, is_base_loose=True)
     return RigGraph((*graph.sensors, BASE), edges, graph.reference), prior
 

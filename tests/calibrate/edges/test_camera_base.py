@@ -5,13 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.edges.camera_base import CameraTravel, _expected, camera_travel, estimate_camera_base
-from pipeline.calibrate.edges.on_base import changes_by_left
+from pipeline.calibrate.edges.camera_base import (
+    CameraTravel,
+    _expected,
+    camera_travel,
+    elsewhere,
+    estimate_camera_base,
+)
+from pipeline.calibrate.edges.on_base import DaySources, changes_by_left
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.graph import BASE, Edge, Sensor
-from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse
+from pipeline.rig.prior import RigPrior
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse, rotation_angle_rad
 from tests.makers.solve_scenes import make_day
 
 EDGE = Edge(Sensor("front", "camera"), BASE)
@@ -210,3 +217,28 @@ def test_where_no_odometry_is_logged_way_and_yaw_are_those_of_the_moments_around
     np.testing.assert_allclose(found.driven_m, 3.0)
     np.testing.assert_allclose(found.turned_rad, 0.03)
     np.testing.assert_allclose(found.turned_by_clock_radps, 0.0, atol=1e-12)
+
+
+def found_elsewhere(T, off_deg, travel):
+    known, names = {("front", "base"): inverse(start(T, off_deg))}, ("front", "base")
+    prior = RigPrior((EDGE.parent, BASE), BASE, known, dict.fromkeys(names, (0.02, 0.05)))
+    sources = DaySources(prior, (), (), lambda _: [], read={"front": (travel, N)})
+    return elsewhere(EDGE, sources, np.radians(6.0))
+
+
+@pytest.mark.parametrize("off_deg", [(0, 0, 30), (30, 0, 0), (0, 90, 0), (0, 0, -90), (60, -60, 60)])
+def test_a_camera_is_found_from_anywhere_by_direction_and_turns(off_deg):
+    T = mounted()
+    found = found_elsewhere(T, off_deg, day(T))
+    assert np.degrees(rotation_angle_rad(found @ inverse(T))) < 0.5
+    assert found[:3, 3] == pytest.approx(T[:3, 3])
+
+
+def test_no_camera_is_elsewhere_that_is_near_mirrored_or_turned_where_nothing_shows_it():
+    T, straight, mirror = mounted(), day(mounted(), turning=0.0), np.diag([-1.0, 1.0, 1.0])
+    travel = day(T)
+    mirrored = replace(travel, turn=-travel.turn @ mirror, direction=travel.direction @ mirror)
+    assert found_elsewhere(T, (3, -4, 5), travel) is None
+    assert found_elsewhere(T, (0, 0, 0), mirrored) is None
+    assert found_elsewhere(T, (60, 0, 0), straight) is None
+    assert rotation_angle_rad(found_elsewhere(T, (0, 0, 60), straight) @ inverse(T)) < np.radians(0.5)

@@ -11,7 +11,8 @@ from pipeline.calibrate.edges.sweep_travel import with_travel
 from pipeline.calibrate.records import Inputs
 from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import BASE, EDGE_OF_PAIR, RigGraph, Sensor, edge_between
-from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse, rotation_angle_rad
+from pipeline.store import current
 from pipeline.store.partitions import Partition
 from schemas.observations import Observation
 from tests.makers.calibrated_days import perturbed, records_of_rows, rig_prior_of
@@ -34,11 +35,11 @@ def prior_of(made):
     return Prior(made.truth["camera_lidar"], made.truth["lidar_radar"], np.radians(2.0), 0.05)
 
 
-def records_of(made, rows):
+def records_of(made, rows, T_camera_lidar=None):
     about = Inputs(Partition("vehicle-1", "2026-03-02"), "joint", "k", 1, ())
-    return {
-        r.pair: r for r in records_of_rows(rows, perturbed(prior_of(made), (1.0, 0.02), 1), made.fleet, about)
-    }
+    prior = perturbed(prior_of(made), (1.0, 0.02), 1)
+    prior = prior if T_camera_lidar is None else replace(prior, T_camera_lidar=T_camera_lidar)
+    return {r.pair: r for r in records_of_rows(rows, prior, made.fleet, about)}
 
 
 def turned(o, deg, *, boxes=False):
@@ -78,6 +79,20 @@ def test_borders_that_motion_contradicts_are_held_by_name_though_held_out_frames
     together = records_of(made, [turned(o, 0.8, boxes=True) for o in made.observations])
     for pair in ("camera_lidar", "camera_radar"):  # two that err alike do not outvote the motion
         assert (together[pair].status, together[pair].faults) == ("held", ["witnesses_disagree"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("off_deg", [(20.0, 20.0, -10.0), (0.0, 90.0, 0.0)])
+def test_a_search_begins_where_the_camera_s_motion_shows_it_and_the_far_prior_holds_it(made, off_deg):
+    T, R = made.truth["camera_lidar"], exp_so3(np.radians(off_deg))
+    far = from_rotation_translation(R @ T[:3, :3], R @ T[:3, 3])
+    found = records_of(made, made.observations, far)
+    record = found["camera_lidar"]
+    assert np.degrees(rotation_angle_rad(current.transform_of(record) @ inverse(T))) < 0.3
+    assert (record.status, record.faults) == (found["camera_radar"].status, ["prior"]) == ("held", ["prior"])
+    assert record.reason.startswith("by its motion camera is ")
+    np.testing.assert_allclose(current.prior_of(record), far, atol=1e-9)
+    assert found["lidar_radar"].status == "accepted"
 
 
 @pytest.mark.parametrize("what", ["few motions", "no road", "a frame of its own"])
