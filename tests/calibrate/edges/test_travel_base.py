@@ -82,7 +82,7 @@ def test_borders_that_motion_contradicts_are_held_by_name_though_held_out_frames
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("off_deg", [(20.0, 20.0, -10.0), (0.0, 90.0, 0.0)])
+@pytest.mark.parametrize("off_deg", [(0.0, 30.0, 0.0), (0.0, -90.0, 0.0)])
 def test_a_search_begins_where_the_camera_s_motion_shows_it_and_the_far_prior_holds_it(made, off_deg):
     T, R = made.truth["camera_lidar"], exp_so3(np.radians(off_deg))
     far = from_rotation_translation(R @ T[:3, :3], R @ T[:3, 3])
