@@ -51,11 +51,8 @@ def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
 def render(top_only: bool) -> str:
     """The table as Markdown."""
     heads = [
-        "question",
-        "measured (95 % interval)",
-        "days, look",
-        "best published" if top_only else "release",
-    ]
+        "question", "measured (95 % interval)", "days, look", "best published" if top_only else "release",
+    ]  # fmt: skip
     chosen = [row for row in rows() if row.get("top") or not top_only]
     body = [_cells(row, top_only) for row in chosen if "file" not in row or (RESULTS / row["file"]).exists()]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [heads, ["---"] * len(heads), *body])

@@ -260,12 +260,8 @@ def _errors(
 def table(lines: Sequence[Mapping[str, Any]]) -> str:
     """A row per fleet: what is certified and wrong, states by night, sensors RED, farther than the prior, CPU."""
     heads = [
-        "fleet",
-        "wrong of certified",
-        "states certified after each night",
-        "moved: RED",
-        "farther than the prior",
-    ]
+        "fleet", "wrong of certified", "states certified after each night", "moved: RED", "farther than the prior",
+    ]  # fmt: skip
     body = []
     for name in dict.fromkeys(r["row"] for r in lines):
         own = [r for r in lines if r["row"] == name]

@@ -70,9 +70,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--root", type=Path, required=True, help="folder of the lakes and runs")
-    parser.add_argument(
-        "--logs", type=Path, default=real.SHARED / "data" / "astyx", help="folder of the real car's logs"
-    )
+    parser.add_argument("--shared", type=Path, default=real.SHARED, help="folder of the data and models")
     parser.add_argument("--parts", nargs="+", choices=["real", "fleet"], default=["real", "fleet"])
     parser.add_argument(
         "--networks", nargs="+", choices=["untrained", *NETWORKS], default=["untrained", *NETWORKS]
