@@ -60,7 +60,7 @@ def main() -> None:
         if not args.shared.is_dir():
             sys.stderr.write(f"{name}real days are left out: no folder {args.shared}\n")
             continue
-        path, lake, day, truth = source(args.shared, args.root)
+        path, lake, day, truth = source(args.shared.resolve(), args.root)
         for (method, deg), seed in product(starts, range(args.starts)):
             row = f"{name}{method}, {deg:g} deg"
             if not any((r["row"], r["seed"]) == (row, seed) for r in lines):
