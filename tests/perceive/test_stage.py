@@ -76,7 +76,7 @@ def test_the_same_work_is_cached_other_work_is_not_and_the_same_frames_give_the_
     seen = []
     write_frames(lake, DAY, changed(made_frame), "frames-key")
     first = perceive_day(DAY, fleet(), lake, progress=lambda *told: seen.append(told))
-    assert seen == [(k, 5, "perceive") for k in range(1, 6)]
+    assert seen == [(k, 5, "frames") for k in range(1, 6)]
     for a, b in zip(observations_of(lake, DAY), whole[1], strict=True):
         assert a.labels_png == b.labels_png
         for name in ("lidar_map_xyz_m", "lidar_edge_xyz_m", "marking_z", "ground_plane", "radar_track_xyz_m"):
