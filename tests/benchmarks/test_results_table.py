@@ -64,10 +64,9 @@ def test_a_second_look_at_a_seed_is_called_one():
 
 
 def test_what_make_benchmark_runs_can_be_begun():
-    from tests.benchmarks.studies import motion, nights, real, run, ssl
+    from tests.benchmarks.studies import nights, real, run, ssl
 
     assert all(fleet.spec.names for fleet in nights.FLEETS.values())
     assert {len(method) for method in real.STARTS} == {2}
     assert set(run.SUMMARIES) < set(run.SETS)
-    assert motion.table([]).count("\n") == 1
     assert all((ssl.RECIPES / recipe).is_file() for recipe, *_ in ssl.NETWORKS.values())

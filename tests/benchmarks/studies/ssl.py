@@ -22,13 +22,17 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.calibrate.networks import calibrate_frame
 from pipeline.core.config import load_fleet
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE
 from pipeline.rig.day_prior import read_transforms
+from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_columns
 from schemas.calibrations import PAIRS
+from schemas.moments import PERCEIVED
 from tests.benchmarks.results_measures import errors, wrong_records
 from tests.benchmarks.studies import real
 from tests.benchmarks.studies.commits import commit_now, is_accepted
@@ -39,6 +43,7 @@ from tests.benchmarks.studies.run import table
 RECIPES = Path(__file__).parent / "ssl_recipes"
 SHIPPED = Path("pipeline/learn/models/joint_classes.onnx")
 STEPS, DRAWS, OFF, FIRST_DAY, PAIRWISE = 240, 4, (2.0, 0.2), "2026-03-02", "pairwise from nothing"
+FRAMES, ABRUPT_DEG = 16, 10.0
 SPLITS = (("00", "01", "02", "03"), ("03", "02", "01", "00"))  # the last one is the test
 SEED, TAUGHT, TESTED = 7501, 6, 4  # of the drawn rig and world: fresh for each release
 # Recipe, what it changes, and whether it begins with the shipped network; of `pairwise` each pair has one of its own.
@@ -86,14 +91,22 @@ def main() -> None:
     lines = [r for r in known if is_accepted(r["commit"], commit_now(), ())]
     for part in parts:
         for name in ["joint", *args.networks]:
-            row = f"{part.name}: {name}"
+            row, of_frames = f"{part.name}: {name}", name not in ("joint", PAIRWISE)
             if not any(r["row"] == row for r in lines):
                 cost = {} if name in ("joint", "untrained") else _trained(part, name)
                 found = [{"row": row, "commit": commit_now()} | cost | r for r in _tested(part, name)]
-                lines += found
-                with args.out.open("a") as file:
-                    file.writelines(json.dumps(r) + "\n" for r in found)
+                lines += _kept(args.out, found)
+            row += ", single frames"
+            if of_frames and not any(r["row"] == row for r in lines):
+                found = [{"row": row, "commit": commit_now()} | r for r in _single_frames(part, name)]
+                lines += _kept(args.out, found)
     sys.stdout.write(f"{look('ssl', [r for r in lines if r['day']['seed']])}\n\n{_table(lines)}\n")
+
+
+def _kept(out: Path, found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    with out.open("a") as file:
+        file.writelines(json.dumps(r) + "\n" for r in found)
+    return found
 
 
 def _real(folder: Path, logs: Path, *split: str) -> Part:
@@ -166,6 +179,23 @@ def _tested(part: Part, name: str) -> list[dict[str, Any]]:
     for (day, truth), draw in product(part.truth.items(), range(part.draws)):
         pairs = real.calibrated(fleet, lake, day, method, OFF, draw, truth)
         found.append({"day": {"day": day.day, "seed": part.seed}, "seed": draw, "pairs": pairs})
+    return found
+
+
+def _single_frames(part: Part, name: str) -> list[dict[str, Any]]:
+    """Single frames of the test, from priors `ABRUPT_DEG` off: the paper's figure 4."""
+    fleet, lake, found = load_fleet(part.fleet), Lake.at(part.folder / "tested"), []
+    if name in NETWORKS:
+        fleet = fleet.changed(learn={"model": str(_models(part, name)["joint"])})
+    for day, truth in part.truth.items():
+        frames = read_columns(lake, PERCEIVED, day, ["moment"])["moment"]
+        for k in np.linspace(0, len(frames) - 1, FRAMES).astype(int).tolist():
+            task = Task(fleet, lake, day, "joint-ssl", perturb=(ABRUPT_DEG, OFF[1]), seed=k)
+            pairs = {}
+            for pair, of in calibrate_frame(task, int(frames[k])).solution.pairs.items():
+                off = np.degrees(errors_at_targets(pair, of.T, truth[pair], DEFAULT_TARGETS)[:2])
+                pairs[pair] = {"status": "held", "az_deg": float(off[0]), "el_deg": float(off[1])}
+            found.append({"day": {"day": day.day, "seed": part.seed}, "seed": k, "pairs": pairs})
     return found
 
 
