@@ -15,7 +15,7 @@ from pipeline.report.day import clearest_alarm, status_sentence
 from pipeline.report.page import page_stem
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
-from pipeline.report.words import ANSWERS, kind_of_sensor, motion_in_words, with_sigma
+from pipeline.report.words import ANSWERS, dof_title, kind_of_sensor, motion_in_words, with_sigma
 from pipeline.store.partitions import Lake
 from schemas.calibrations import STATUSES
 from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of
@@ -198,7 +198,7 @@ def _sure(finding: DriftFinding) -> str:
 
 
 def _chart_words(finding: DriftFinding) -> str:
-    chart = f"{finding.parent_frame}-{finding.child_frame} {finding.dof}"
+    chart = f"{finding.parent_frame}-{finding.child_frame} {dof_title(finding.pair, finding.dof)}"
     if finding.magnitude is None or finding.magnitude_sigma is None:
         return chart
     return f"{chart} {with_sigma(finding.magnitude, finding.magnitude_sigma, finding.dof)}"
