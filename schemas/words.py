@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
 __all__ = [
     "AXIS_NAMES", "DAY_WORDS", "NEXT_STEPS", "RECORD_WORDS", "STATE_WORDS", "VEHICLE_WORDS",
-    "axes_in_words", "day_word", "listed",
+    "axes_in_words", "day_word", "listed", "sentences_of",
 ]  # fmt: skip
 
 _BODY = ("roll", "pitch", "yaw", "forward", "left", "up")
@@ -84,3 +84,12 @@ def axes_in_words(kind: str, observable: Sequence[bool], certified: Sequence[str
     resting = ", ".join(n for n, seen in zip(names, observable, strict=True) if not seen)
     parts = [f"used: {used or 'nothing'}", f"certified: {', '.join(certified) or 'nothing'}"]
     return "; ".join([*parts, f"at the prior: {resting}"] if resting else parts)
+
+
+def sentences_of(templates: Mapping[str, str]) -> Callable[..., str]:
+    """A function that gives one of a room's sentences by its name, with its fields filled."""
+
+    def because(name: str, /, **fields: object) -> str:
+        return templates[name].format(**fields)
+
+    return because

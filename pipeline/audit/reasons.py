@@ -1,6 +1,6 @@
 """Every reason that charts, vehicles and states give, as one list; fields are filled where the reason is given."""
 
-from pipeline.core.sentences import sentences_of
+from schemas.words import sentences_of
 
 __all__ = ["REASONS", "because"]
 

@@ -1,6 +1,6 @@
 """Every reason and note that records and poses of a day give, as one list; fields are filled where each is given."""
 
-from pipeline.core.sentences import sentences_of
+from schemas.words import sentences_of
 
 __all__ = ["REASONS", "because"]
 

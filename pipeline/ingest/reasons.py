@@ -3,7 +3,7 @@
 What is wrong in one message or file stands beside the code that reads it.
 """
 
-from pipeline.core.sentences import sentences_of
+from schemas.words import sentences_of
 
 __all__ = ["REASONS", "because"]
 

@@ -25,18 +25,9 @@ from pipeline.store.views import Chosen
 from schemas.observations import Observation
 
 __all__ = [
-    "CHANGES",
-    "STANCE",
-    "DaySources",
-    "Regression",
-    "Rows",
-    "Series",
-    "changes_by_left",
-    "first_and_last",
-    "of_stance_and",
-    "other_scenes",
-    "regress",
-]
+    "CHANGES", "STANCE", "DaySources", "Regression", "Rows", "Series", "changes_by_left", "first_and_last",
+    "of_stance_and", "other_scenes", "regress",
+]  # fmt: skip
 
 _ODOMETRY = "odometry"
 

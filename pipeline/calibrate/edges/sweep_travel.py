@@ -25,14 +25,8 @@ from pipeline.store.views import Chosen
 from schemas.observations import Observation
 
 __all__ = [
-    "Sweep",
-    "SweepTravel",
-    "deskewed_again",
-    "sweep_travel",
-    "sweeps_of",
-    "vehicle_sized",
-    "with_travel",
-]
+    "Sweep", "SweepTravel", "deskewed_again", "sweep_travel", "sweeps_of", "vehicle_sized", "with_travel",
+]  # fmt: skip
 
 # --------------------------------------------------------------------------------------------------
 # Sweeps of one lidar for the edges, from any table, and repeated de-skewing.
