@@ -289,17 +289,22 @@ def _midway(tracks: Tracks, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _residuals(tracks: Tracks, turn: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sampson residuals [rad] and their derivative by a step of `_moved`, the denominator held."""
+    """Sampson residuals [rad] and their derivative by a step of `_moved`.
+
+    Their size takes part in the derivative: with it held, noise of the tracks drew the direction of a side camera .1 to
+    .5 deg outward.
+    """
     m0, m1 = _midway(tracks, turn)
-    normal = _cross(m1, m0)
+    across, normal = _across(direction), _cross(m1, m0)
     at_0, at_1 = _cross(direction, m1), _cross(m0, direction)
     e = normal @ direction
     # |a|^2 less its part along the bearing; both such parts are e.
-    size = np.sqrt(np.maximum((at_0**2).sum(1) + (at_1**2).sum(1) - 2 * e**2, 1e-12))
-    u0, u1, cosine = m0 @ direction, m1 @ direction, (m0 * m1).sum(1)
-    by_turn = 0.5 * (m0 * u1[:, None] + m1 * u0[:, None]) - np.outer(cosine, direction)
-    J = np.concatenate([by_turn, normal @ _across(direction)], 1)
-    return e / size, J / size[:, None]
+    square = np.maximum((at_0**2).sum(1) + (at_1**2).sum(1) - 2 * e**2, 1e-12)
+    u0, u1 = (m0 @ direction)[:, None], (m1 @ direction)[:, None]
+    by_turn = 0.5 * (m0 * u1 + m1 * u0) - np.outer((m0 * m1).sum(1), direction)
+    J = np.concatenate([by_turn, normal @ across], 1)
+    grown = np.concatenate([u1 * at_0 + u0 * at_1, -2 * (u1 * m1 + u0 * m0) @ across], 1) - 4 * e[:, None] * J
+    return e / np.sqrt(square), (J - (e / (2 * square))[:, None] * grown) / np.sqrt(square)[:, None]
 
 
 def _across(direction: np.ndarray) -> np.ndarray:

@@ -10,7 +10,9 @@ from pipeline.perceive.image_motion import (
     MotionReason,
     NoMotionError,
     Tracks,
+    _moved,
     _pixel_rad,
+    _residuals,
     motion_of_tracks,
 )
 from pipeline.rig.cameras import Camera
@@ -101,6 +103,20 @@ def test_a_rolling_shutter_is_no_motion():
     as_if_at_once, known = (np.degrees(np.linalg.norm(np.mean(off[k], axis=0))) for k in off)
     assert known < 0.04
     assert as_if_at_once > 3 * known
+
+
+@pytest.mark.parametrize("direction", [(0.05, -0.02, 1.0), (0.95, 0.0, 0.3)])
+def test_residuals_have_the_derivative_of_a_step(direction):
+    """With their size held, the direction of noisy tracks of a camera that looks aside is drawn outward."""
+    tracks, turn, u = tracks_of(
+        CAMERAS["pinhole"], turn=(0.02, 0.05, -0.01), direction=direction, noise_px=3.0
+    )
+    J = _residuals(tracks, turn, u)[1]
+    steps = np.eye(5) * 1e-6
+    ahead, back = (
+        np.stack([_residuals(tracks, *_moved(turn, u, d))[0] for d in sign * steps]) for sign in (1, -1)
+    )
+    np.testing.assert_allclose((ahead - back).T / 2e-6, J, atol=1e-7)
 
 
 @pytest.mark.parametrize("direction", [(0.05, -0.02, 1.0), (0.0, 0.1, -1.0)])
