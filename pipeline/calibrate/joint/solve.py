@@ -163,10 +163,11 @@ _FIXED = np.arange(6 + len(BOX_CLASSES)) // 3 == 1  # the position: angles of fa
 # Scan about the camera's vertical: step, reach in search ranges, and clusters that a turn at the end of the range
 # must match more than none.
 _SCAN_STEP_RAD, _SCAN_REACH, _SCAN_PRIOR = np.radians(0.5), 1.2, 2.0
-# A turn so far from the best one that matches such a share of its clusters leaves the azimuth open. Tuned on 18
-# days (seeds 110 to 121, 4100 to 4105): on two highways traffic in the next lane matched 0.84 to 0.98, and the
-# azimuth was 3 deg wrong at a sigma of 0.4; elsewhere 0.46 to 0.80 but for two days.
-_RIVAL_APART_RAD, _RIVAL_SHARE = np.radians(2.0), 0.82
+# A turn so far from the best one leaves the azimuth open where both match about as many clusters: less than so many of
+# the matches' own sigmas apart. Tuned on 60 edges (seeds 7101 to 7127, 7401, 7423, a real car): by 1.46 and more,
+# azimuths were right; by .94 and less, up to 7 deg off: on highways by traffic in the next lane, of side cameras by
+# too few matches.
+_RIVAL_APART_RAD, _RIVAL_SIGMAS = np.radians(2.0), 1.2
 # Then one Newton step per gate, each no longer than some rad.
 _AZIMUTH_GATES_RAD = np.radians([4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0])
 _STEPS_AT_FIRST_BOX_GATE, _MAX_STEP_RAD = 4, 0.05
@@ -204,7 +205,7 @@ def estimate_camera_radar(
     seen = _Seen(observations, moving_clusters(observations), vehicle_boxes(observations if boxes else []))
     prior_covariance = prior.covariance("camera_radar")
     before = np.append(np.diag(prior_covariance), np.full(len(BOX_CLASSES), BIAS_SIGMA_RAD**2))
-    T_start, rival = _scan_azimuth(seen.clusters, prior.T_camera_radar, config)
+    T_start, rival, sigmas = _scan_azimuth(seen.clusters, prior.T_camera_radar, config)
     T, last = _solve_camera_radar(seen, prior.T_camera_radar, T_start, before)
     block = blocks_of(observations, config.bootstrap_blocks)
     information = last.H.sum(0) + np.diag(1 / before)
@@ -213,7 +214,7 @@ def estimate_camera_radar(
     J = np.linalg.inv(change_jacobian(T))
     after = posterior(covariance, prior_covariance, CAMERA_RADAR_BIAS)
     notes = [because("no shift")]
-    if rival > _RIVAL_SHARE:
+    if sigmas < _RIVAL_SIGMAS:
         after = _with_open_azimuth(after, prior_covariance)
         notes.append(because("azimuth open", share=rival))
     frames = len(np.unique(seen.clusters.frame))
@@ -276,10 +277,12 @@ def _solve_camera_radar(
     return T, equations
 
 
-def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig) -> tuple[np.ndarray, float]:
+def _scan_azimuth(
+    clusters: MovingClusters, T0: np.ndarray, config: SolveConfig
+) -> tuple[np.ndarray, float, float]:
     """The rotation about the camera's vertical at which most moving clusters match a box, near ones first.
 
-    Also returns the matches of the best other rotation, as a share of this one's.
+    Also returns the matches of the best other rotation: as a share of this one's, and by how many sigmas fewer.
     """
     reach = np.radians(_SCAN_REACH * config.search_rotation_deg)
     turns = np.arange(-np.ceil(reach / _SCAN_STEP_RAD), np.ceil(reach / _SCAN_STEP_RAD) + 1) * _SCAN_STEP_RAD
@@ -295,7 +298,9 @@ def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig)
     best = int(np.argmax(scores))
     elsewhere = np.abs(turns - turns[best]) >= _RIVAL_APART_RAD
     rival = max((s for s, far in zip(scores, elsewhere, strict=True) if far), default=0.0)
-    return poses[best], float(np.clip(rival / scores[best], 0.0, 1.0)) if scores[best] > 0 else 0.0
+    most, other = max(scores[best], 0.0), max(rival, 0.0)
+    both = max(most + other, 1.0)
+    return poses[best], other / max(most, 1.0), (most - other) / both**0.5
 
 
 def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equations:
