@@ -74,6 +74,15 @@ class Answers:
     bias_sigma: Float[np.ndarray, " 6"]  # of all answers, (bearing rotation [rad], translation [m])
     # Where searches that started all over the prior ended, about the centre; None: nobody looked (days have frames).
     ends: Float[np.ndarray, "M 6"] | None = None
+    ends_worth: Float[np.ndarray, " M"] | None = None  # their weights, of sum 1
+
+    @property
+    def ends_covariance(self) -> Float[np.ndarray, "3 3"]:
+        """Of the rotations at the ends; 0 where nobody looked."""
+        if self.ends is None:
+            return np.zeros((3, 3))
+        unbiased = len(self.ends) / (len(self.ends) - 1)
+        return np.asarray(unbiased * np.cov(self.ends[:, :3].T, aweights=self.ends_worth, ddof=0))
 
 
 def twists_about(
@@ -202,8 +211,7 @@ def _spread(answers: Answers, draws: np.ndarray, ignored: np.ndarray) -> Float[n
     spread = np.cov(draws[:, 0].T)
     predicted = np.median(answers.variance, axis=0) / answers.frames
     spread += np.diag(np.maximum(predicted - np.diag(spread), 0.0) + np.square(answers.bias_sigma))
-    if answers.ends is not None:
-        spread[:3, :3] += ENDS_FACTOR**2 * np.cov(answers.ends[:, :3].T)
+    spread[:3, :3] += ENDS_FACTOR**2 * answers.ends_covariance
     return np.asarray(spread + np.diag(np.where(ignored, _IGNORED, 0.0)))
 
 
@@ -272,9 +280,8 @@ def _update(
 
 def _diagnostics(fit: _Fit, gain: np.ndarray, answers: Answers) -> dict[str, float]:
     """Scatter of one frame's answers, the share of a guess that answers repeat, and how many answers are outliers."""
-    ends = np.zeros((2, 3)) if answers.ends is None else answers.ends[:, :3]
     return {
-        "ends_apart_deg": float(np.degrees(np.linalg.norm(ends.std(axis=0)))),
+        "ends_apart_deg": float(np.degrees(np.sqrt(np.trace(answers.ends_covariance)))),
         "frame_scatter_deg": float(np.degrees(np.linalg.norm(fit.scatter[:3]))),
         "frame_scatter_m": float(np.linalg.norm(fit.scatter[3:])),
         "repeated_rotation": float(np.abs(np.diag(gain)[:3]).max()),

@@ -16,7 +16,7 @@ from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
 __all__ = [
     "APART_RAD", "JOINT_BIAS_SIGMA", "Expected", "JointDay", "JointFit", "climbed", "fit_of", "fitted_day",
-    "rival_score", "voted",
+    "likelihood", "rival_score", "voted",
 ]  # fmt: skip
 
 _Place = tuple[np.ndarray, float]  # T_camera_lidar, and the clock beyond what is expected [s]
@@ -155,8 +155,22 @@ def voted(
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The candidates, those first that frames spread over the day fit best."""
     voters = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _VOTERS).astype(int))]
-    fitting = np.array([scores(voters, T)[0].sum() for T in candidates])
-    return [candidates[i] for i in np.argsort(-fitting, kind="stable")]
+    return [candidates[i] for i in np.argsort(-_fitting(voters, candidates), kind="stable")]
+
+
+def likelihood(
+    looks: Sequence[FrameEvidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
+) -> Float[np.ndarray, " C"]:
+    """Relative likelihood of poses by one frame, whose points were chosen in several ways; its sum is 1."""
+    fitting = _FIRST_WORTH * _fitting(looks, candidates) / len(looks)
+    relative = np.exp(fitting - fitting.max())
+    return np.asarray(relative / relative.sum())
+
+
+def _fitting(
+    frames: Sequence[FrameEvidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
+) -> Float[np.ndarray, " C"]:
+    return np.array([scores(frames, T)[0].sum() for T in candidates])
 
 
 def climbed(

@@ -14,7 +14,7 @@ from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.learn.infer.aggregate import BIAS_SIGMA, Answers, day_estimate, mean_answer, twists_about
 from pipeline.learn.infer.class_evidence import FrameEvidence
-from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day
+from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day, likelihood
 from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
 from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
@@ -149,22 +149,25 @@ def single_frame_solution(
         raise SolveError(f"frame {frame.frame_index}: {rejection.reason.value}") from rejection
     asked = _Asked(networks, prior, [sensors], [observation])
     rng = np.random.default_rng([seed, 7])
-    centre, ends = _searched(asked, rng)
+    centre, ends, worth = _searched(asked, rng)
     found = _ask(asked, [0] * _GUESSES_OF_ONE_FRAME, centre, rng, lambda _: None)
-    estimates = {
-        pair: _estimate(pair, replace(found[pair], ends=twists_about(centre[pair], ends[pair])), asked, rng)
-        for pair in PAIRS
-    }
+    estimates = {}
+    for pair, own in found.items():
+        told = replace(own, ends=twists_about(centre[pair], ends[pair]), ends_worth=worth[pair])
+        estimates[pair] = _estimate(pair, told, asked, rng)
     if not estimates["camera_lidar"].observable.any():
         # The picture does not determine it, so nor the radar's pose.
         estimates["camera_radar"] = PairEstimate.at_prior("camera_radar", prior)
     return Solution(method, estimates)
 
 
-def _searched(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Ends of searches from starts all over the prior on one frame: by pair their median, and each end.
+def _searched(
+    asked: _Asked, rng: np.random.Generator
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Ends of searches from starts all over the prior on one frame: by pair the centre, each end, and its worth.
 
-    Only far starts show that a frame fits in several places: near ones all end in the same place.
+    Only far starts show that a frame fits in several places: near ones all end in the same place. But some of them end
+    where nothing fits, which the network's evidence shows.
     """
     prior = asked.prior
     starts = _scattered(_STARTS_OF_ONE_FRAME, rng, prior.rotation_sigma_rad, prior.translation_sigma_m)
@@ -181,7 +184,21 @@ def _searched(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.nda
     centre = {
         p: exp_se3(np.median(twists_about(prior.of(p), T), axis=0)) @ prior.of(p) for p, T in stacked.items()
     }
-    return centre, stacked
+    worth = dict.fromkeys(PAIRS, np.full(len(starts), 1 / len(starts)))
+    looks = [
+        look
+        for network, sensors in zip(asked.networks, asked.sensors[0], strict=True)
+        if "camera_lidar" in network.pairs
+        for T in ends["camera_lidar"]
+        if (look := network.evidence(sensors, T)) is not None
+    ]
+    if looks:
+        worth["camera_lidar"] = likelihood(looks, ends["camera_lidar"])
+        centre["camera_lidar"] = ends["camera_lidar"][int(worth["camera_lidar"].argmax())]
+    if looks and asked.composed:
+        worth["camera_radar"] = worth["camera_lidar"]
+        centre["camera_radar"] = centre["camera_lidar"] @ centre["lidar_radar"]
+    return centre, stacked, worth
 
 
 @dataclass(frozen=True, eq=False)

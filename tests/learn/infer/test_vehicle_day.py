@@ -22,6 +22,7 @@ from pipeline.rig.se3 import exp_se3, inverse, log_se3
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from tests.learn.infer.test_joint_fit import frame as evidence_of
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
@@ -172,6 +173,11 @@ def test_one_frame_is_a_calibration_with_the_sigma_of_one_frame(frames):
 class Alike(Oracle):
     """A network whose frame looks alike from two places, 5 deg of azimuth apart: it goes to the nearer one."""
 
+    shown = None
+
+    def evidence(self, _sensors, _T_camera_lidar):
+        return self.shown
+
     def answer(self, sensors, guess):
         found = super().answer(sensors, guess)
         other = exp_se3(np.array([0.0, np.radians(5.0), 0.0, 0.0, 0.0, 0.0]))
@@ -194,6 +200,21 @@ def test_a_frame_that_looks_alike_from_two_places_cannot_tell_and_says_so(frames
             np.testing.assert_allclose(found.pairs[pair].T, prior.of(pair), atol=1e-6)
         assert found.pairs["camera_lidar"].diagnostics["ends_apart_deg"] > 1.5
         assert found.pairs["lidar_radar"].observable[2]
+
+
+def test_evidence_shows_at_which_of_two_places_a_search_ended_where_nothing_fits(frames):
+    observations, images = frames
+    network = Alike(noise=0.02)
+    network.shown = evidence_of(3)
+    shift = exp_se3(
+        np.array([0.0, np.radians(3.0), 0.0, 0.0, 0.0, 0.0])
+    )  # more than half end at the wrong place
+    prior = Prior(shift @ T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
+    found = single_frame_solution(
+        images[3], observations[3], prior, networks=[network], method="joint-ssl", seed=0
+    )
+    assert found.pairs["camera_lidar"].observable[:3].all()
+    assert np.abs(errors_deg(found)["camera_lidar"]).max() < 0.2
 
 
 def exported(folder, *kinds):
