@@ -15,9 +15,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import brentq
-from scipy.special import owens_t
-from scipy.stats import norm
-from scipy.stats import t as student_t
+from scipy.special import ndtr, ndtri, owens_t, stdtrit
 
 __all__ = ["Charts", "alarm_threshold", "clipped", "thresholds"]
 
@@ -111,8 +109,8 @@ def thresholds(
 @lru_cache(maxsize=16384)
 def _threshold(count: int, freedom: int, probability: float, autocorrelation: float, of: str) -> float:
     # As many independent splits as in the bound for known sigmas, each with Student's t: the scale is unknown.
-    one = norm.sf(alarm_threshold(np.ones(count), probability, autocorrelation, of))
-    return float(student_t.isf(one, freedom))
+    one = ndtr(-alarm_threshold(np.ones(count), probability, autocorrelation, of))
+    return float(-stdtrit(freedom, one))
 
 
 def alarm_threshold(
@@ -139,11 +137,11 @@ def alarm_threshold(
     slope = np.sqrt((1 - r) / (1 + r))
 
     def excess(h: float) -> float:
-        return 2 * norm.sf(h) + 4 * owens_t(h, slope).sum() - false_alarm_probability
+        return 2 * ndtr(-h) + 4 * owens_t(h, slope).sum() - false_alarm_probability
 
     # 2 sf(h) alone bounds from below, Bonferroni over all splits from above.
-    low = norm.isf(false_alarm_probability / 2)
-    high = norm.isf(false_alarm_probability / (2 * len(sigma)))
+    low = -ndtri(false_alarm_probability / 2)
+    high = -ndtri(false_alarm_probability / (2 * len(sigma)))
     return float(brentq(excess, low - 1e-9, high + 1e-9)) if len(r) else float(low)
 
 

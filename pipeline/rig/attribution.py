@@ -21,7 +21,7 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from pipeline.rig.graph import KINDS, Edge
 from pipeline.rig.se3 import adjoint
@@ -161,7 +161,7 @@ def _explains(cost: float, total: float, freedom: int, known_by: float) -> bool:
 
     The scale of the residual was estimated from a few days, hence F instead of chi-squared (Hotelling 1931).
     """
-    chance = f_distribution.sf(cost / freedom, freedom, min(known_by, _KNOWN))
+    chance = fdtrc(freedom, min(known_by, _KNOWN), cost / freedom)
     return bool(chance >= _MISFIT_PROBABILITY or cost <= (1 - _WHOLE_STORY) * total)
 
 

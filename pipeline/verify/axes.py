@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from pipeline.core.config import VerifyConfig
 from pipeline.core.stage_work import Probes
@@ -106,7 +106,7 @@ def kind_of_pose(kind: str) -> str:
 
 def shared_sigmas(axes: int) -> float:
     """Threshold in sigmas for several axes, with the false-alarm probability of three sigmas for one."""
-    return float(norm.isf(norm.sf(CONTRADICTION_SIGMAS) / max(axes, 1)))
+    return float(-ndtri(ndtr(-CONTRADICTION_SIGMAS) / max(axes, 1)))
 
 
 def check_pose(

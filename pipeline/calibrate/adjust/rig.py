@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import eigh
-from scipy.special import ndtri_exp
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtr, ndtri, ndtri_exp
 
 from pipeline.calibrate.adjust.equations import Equations, LinearEdge, Rig, equations_at
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, inverse_of_information
@@ -228,7 +227,7 @@ def _worst(
         return None
     # One false alarm a rig, not an edge: the limit's probability is shared among the cycles, for the edges of one cycle
     # are all as far from the others.
-    limit = float(norm.isf(norm.sf(sigmas) / max(len(graph.with_edges(tested).cycles()), 1)))
+    limit = float(-ndtri(ndtr(-sigmas) / max(len(graph.with_edges(tested).cycles()), 1)))
     beyond = {edge: found[edge][0] for edge in tested if found[edge][1] > limit}
     if not beyond:
         return None
@@ -320,5 +319,5 @@ def innovation(
 
 def _sigmas(square: float, freedom: int) -> float:
     """Normal deviate of equal probability; the root of chi-squared if that is below the number range."""
-    log_probability = float(chi2.logsf(square, freedom))
-    return float(-ndtri_exp(log_probability - np.log(2))) if np.isfinite(log_probability) else square**0.5
+    probability = float(chdtrc(freedom, square))
+    return float(-ndtri_exp(np.log(probability) - np.log(2))) if probability else square**0.5

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.calibrate.tracking.object_tracks import Track
@@ -320,7 +320,7 @@ def consistency(
     dof = (n - 1) / max(share, 1e-3) ** 2
     if dof <= p:
         return 0.0, float("inf")
-    threshold = p * dof / (dof - p + 1) * f_distribution.ppf(_CONFIDENCE, p, dof - p + 1)
+    threshold = p * dof / (dof - p + 1) * fdtri(p, dof - p + 1, _CONFIDENCE)
     return float(turned @ u), float(threshold)
 
 
