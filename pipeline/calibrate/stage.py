@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
-from dataclasses import asdict, fields, replace
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -208,7 +208,8 @@ def _read(task: Task, seed: int, method: Method) -> RigDay:
     reference = None if rig.reference is None else nodes[rig.reference]
     graph = find_edges(prior, overlaps, named=rig.named_edges, reference=reference)
     before = partial(accepted_before, task.lake, task.partition, method.name)
-    return RigDay(rig, graph, prior, views, _shared_rows(task), before)
+    known: dict[str, list[Any]] = {}  # a sensor is read and held once, however many of its edges keep it
+    return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen, known), before)
 
 
 def _known(task: Task, rig: Rig, seed: int) -> tuple[RigPrior, dict[str, View]]:
@@ -234,26 +235,8 @@ def _view(task: Task, chosen: Chosen, moments: Sequence[int]) -> View | None:
     return views_of(rows).get(kind)
 
 
-def _shared_rows(task: Task) -> Callable[[Chosen], list[Observation]]:
-    """Reads rows of chosen sensors; what a sensor measured is held once, however many of its edges keep it."""
-    known: dict[tuple[str, str, int], np.ndarray] = {}
-
-    def shared(o: Observation, chosen: Chosen) -> Observation:
-        same: dict[str, Any] = {}
-        for one in fields(o):
-            value = getattr(o, one.name)
-            if isinstance(value, np.ndarray):
-                sensor = chosen.get(one.name.partition("_")[0], chosen.get("camera", ""))
-                first = known.setdefault((sensor, one.name, o.frame_index), value)
-                if first is not value and first.dtype == value.dtype and np.array_equal(first, value):
-                    same[one.name] = first
-        return replace(o, **same)
-
-    return lambda chosen: [shared(o, chosen) for o in _rows(task, chosen)]
-
-
-def _rows(task: Task, chosen: Chosen) -> list[Observation]:
-    return list(observations_of(task.lake, task.partition, chosen=chosen))
+def _rows(task: Task, chosen: Chosen, known: dict[str, list[Any]] | None = None) -> list[Observation]:
+    return list(observations_of(task.lake, task.partition, chosen=chosen, known=known))
 
 
 def accepted_before(

@@ -130,8 +130,11 @@ def joined(
     partition: Partition,
     sensors: Sequence[str] | None = None,
     moments: Sequence[int] | None = None,
+    known: dict[str, list[Any]] | None = None,
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Moments of a vehicle-day in order, with rows by sensor; one row group of each file is in memory.
+
+    `known` collects the rows of sensors, of whole days alone: a sensor that it has is not read again.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
@@ -151,6 +154,9 @@ def joined(
         )
         for s in names
     }
+    if known is not None:
+        known |= {s: list(stream) for s, stream in streams.items() if s not in known}
+        streams = {s: iter(known[s]) for s in names}
     for moment in index:
         yield moment, {s: next(stream) for s, stream in streams.items() if s in moment.rows}
 

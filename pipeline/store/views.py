@@ -70,10 +70,11 @@ def frames_of(
 
 
 def observations_of(
-    lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None
-) -> Iterator[Observation]:
-    """Observations of a vehicle-day; arguments and errors as `frames_of`."""
-    for moment, rows, priors in _seen(lake, PERCEIVED, partition, moments, chosen):
+    lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None,
+    known: dict[str, list[Any]] | None = None,
+) -> Iterator[Observation]:  # fmt: skip
+    """Observations of a vehicle-day; arguments and errors as `frames_of`, `known` as `joined`."""
+    for moment, rows, priors in _seen(lake, PERCEIVED, partition, moments, chosen, known):
         yield Observation(
             **_stamps(moment, rows), priors=priors, ego_speed_mps=moment.ego_speed_mps,
             ego_yaw_rate_radps=moment.ego_yaw_rate_radps, **_columns(rows, _FOUND),
@@ -115,6 +116,7 @@ def _seen(
     partition: Partition,
     moments: Sequence[int] | None,
     chosen: Chosen | None,
+    known: dict[str, list[Any]] | None = None,
 ) -> Iterator[tuple[Any, dict[str, Any], dict[str, np.ndarray]]]:
     """Moments with the rows of the chosen sensors, by kind, and their priors."""
     manifest = read_manifest(lake, schema, partition)
@@ -122,7 +124,7 @@ def _seen(
     logged = () if manifest is None else manifest.extra.get(PRIOR, ())
     names = {kind: name for name, kind in reversed(sensors.items())} if chosen is None else dict(chosen)
     priors = {log: priors_of(star, names) for log, star in logged_stars(logged).items()}
-    for moment, found in joined(lake, schema, partition, list(names.values()), moments):
+    for moment, found in joined(lake, schema, partition, list(names.values()), moments, known):
         rows = {kind: found[name] for kind, name in names.items() if name in found}
         if len(rows) >= min(2, len(names)):
             yield moment, rows, priors.get(moment.log, {})

@@ -217,6 +217,8 @@ def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) 
         "the radar is turned by 180 deg": T_lidar_radar @ turn,
     }
     as_given = _met(observations, T_lidar_radar)
+    if _MORE * as_given > 1.0:  # no other can meet so much more
+        return []
     met, how = max((_met(observations, T), how) for how, T in tried.items())
     if met < max(_LEAST_MET, _MORE * as_given):
         return []

@@ -29,6 +29,7 @@ __all__ = [
 
 NO_BOUNDARY = -128  # no boundary of this direction within REACH_PX
 REACH_PX = 96
+_NONE = 10_000  # no boundary yet: beyond any image
 CONTRAST_STEP = 1 / 32  # of a standard deviation: one byte reaches +-4
 _MIN_ROAD_PX_IN_ROW = 12
 _ROAD = 0
@@ -41,7 +42,6 @@ _DEPTH_ORDER[[10]] = _SKY
 _DEPTH_ORDER[[0, 1, 9]] = _GROUND
 _DEPTH_ORDER[[2, 3, 4, 8]] = _BACKDROP
 _DEPTH_ORDER[[5, 6, 7, 11, 12, 13, 14, 15, 16, 17, 18]] = _OBJECT
-_FAR_PX = 10_000  # beyond any image
 _COLUMN_PX = 8.0
 
 
@@ -78,76 +78,105 @@ def _foreground_table() -> UInt8[np.ndarray, "256 256"]:
 _FOREGROUND = _foreground_table()
 
 
+def boundary_offsets(
+    labels: UInt8[np.ndarray, "H W"], out: Int8[np.ndarray, "4 H W"] | None = None
+) -> Int8[np.ndarray, "4 H W"]:
+    """Offsets to boundaries by direction class: at pixel + offset + 1/2, or NO_BOUNDARY out of reach."""
+    out = np.empty((4, *labels.shape), np.int8) if out is None else out
+    differs = np.zeros(labels.shape, bool)  # NumPy compares 64 pixels at once
+    np.not_equal(labels[:, :-1], labels[:, 1:], out=differs[:, :-1])
+    _scan(_FOREGROUND, labels, np.flatnonzero(differs), np.flatnonzero(labels[:-1] != labels[1:]), out)
+    return out
+
+
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def _scan(foreground: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
+def _scan(
+    foreground: np.ndarray, labels: np.ndarray, beside: np.ndarray, below: np.ndarray, out: np.ndarray
+) -> None:
     """Fill out[4, H, W] with offsets to the nearest boundary of each direction class along its axis.
 
-    Sides of objects by stretches of each row; tops and feet by one pass down and one up.
+    Flat indices of pixels `beside` and `below` which another label lies. Sides of objects by stretches of each row;
+    tops and feet by one pass down and one up.
     """
     height, width = labels.shape
-    last = np.full((2, width), -10000, np.int32)
+    _fill_rows(foreground, labels, beside, out)
+    nearest = np.full((2, width), -_NONE, np.int16)
+    at = 0
     for i in range(height):
-        _along_row(foreground, labels[i], out[:2, i])
         for side in range(2):
-            o, above = out[2 + side, i], last[side]
-            for j in range(width):
-                n = above[j] - i
-                o[j] = n if n >= -REACH_PX else NO_BOUNDARY
-        if i + 1 < height:
-            _note_below(foreground, labels, i, last)
-    following = np.full((2, width), 10000, np.int32)
+            _from_above(nearest[side], np.int16(i), out[2 + side, i])
+        while at < below.shape[0] and below[at] < (i + 1) * width:
+            _note_below(foreground, labels, i, below[at] - i * width, nearest)
+            at += 1
+    nearest[:] = _NONE
     for i in range(height - 1, -1, -1):
-        if i + 1 < height:
-            _note_below(foreground, labels, i, following)
+        while at > 0 and below[at - 1] >= i * width:
+            at -= 1
+            _note_below(foreground, labels, i, below[at] - i * width, nearest)
         for side in range(2):
-            o, below = out[2 + side, i], following[side]
-            for j in range(width):
-                n = below[j] - i
-                # k + 1/2 ahead is nearer than -1/2 - k behind
-                if n <= REACH_PX and (o[j] == NO_BOUNDARY or 2 * n + 1 < -2 * o[j] - 1):
-                    o[j] = n
+            _from_below(nearest[side], np.int16(i), out[2 + side, i])
 
 
 @no_type_check
 @numba.njit(cache=True, nogil=True, inline="always")
-def _note_below(foreground: np.ndarray, labels: np.ndarray, i: int, along: np.ndarray) -> None:
-    """Note the boundaries below the pixels of row i, by the side of their foreground."""
-    for j in range(labels.shape[1]):
-        if labels[i, j] != labels[i + 1, j]:
-            near = foreground[labels[i, j], labels[i + 1, j]]
-            if near & 1:
-                along[0, j] = i
-            if near & 2:
-                along[1, j] = i
+def _note_below(foreground: np.ndarray, labels: np.ndarray, i: int, j: int, nearest: np.ndarray) -> None:
+    """Note a boundary below row i, by the side of its foreground."""
+    near = foreground[labels[i, j], labels[i + 1, j]]
+    for side in range(2):
+        if near & (1 << side):
+            nearest[side, j] = i
 
 
 @no_type_check
 @numba.njit(cache=True, nogil=True)
-def _along_row(foreground: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
-    """Offsets along one row [2, W], for every stretch between two boundaries of a class."""
-    width = row.shape[0]
+def _from_above(nearest: np.ndarray, row: int, out: np.ndarray) -> None:
+    """Offsets of a row to the last boundaries above it; a function of its own becomes vector instructions."""
+    for j in range(out.shape[0]):
+        n = np.int16(nearest[j] - row)
+        out[j] = n if n >= -REACH_PX else NO_BOUNDARY
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True)
+def _from_below(nearest: np.ndarray, row: int, out: np.ndarray) -> None:
+    """Offsets of a row to the boundaries below it where they are nearer: k + 1/2 ahead than -1/2 - k behind."""
+    for j in range(out.shape[0]):
+        n, before = np.int16(nearest[j] - row), np.int16(out[j])
+        is_nearer = (before == NO_BOUNDARY) | (np.int16(n + before) < -1)
+        out[j] = n if (n <= REACH_PX) & is_nearer else before
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True)
+def _fill_rows(foreground: np.ndarray, labels: np.ndarray, beside: np.ndarray, out: np.ndarray) -> None:
+    """Offsets along the rows, for every stretch between two boundaries of a class."""
+    height, width = labels.shape
     for side in range(2):
-        begin, behind = 0, -10000
-        for j in range(width):
-            at_end = j == width - 1
-            ends = not at_end and row[j] != row[j + 1] and foreground[row[j], row[j + 1]] & (1 << side) > 0
-            if not (ends or at_end):
-                continue
-            ahead = j if ends else 10000
-            for k in range(begin, j + 1):
-                n = behind - k
-                if n < -REACH_PX or 2 * (ahead - k) + 1 < -2 * n - 1:
-                    n = ahead - k
-                out[side, k] = n if n <= REACH_PX else NO_BOUNDARY
-            begin, behind = j + 1, j
+        at = 0
+        for i in range(height):
+            row, begin, behind = out[side, i], 0, -_NONE
+            while at < beside.shape[0] and beside[at] < (i + 1) * width:
+                j = beside[at] - i * width
+                at += 1
+                if foreground[labels[i, j], labels[i, j + 1]] & (1 << side):
+                    _fill(row, begin, j + 1, behind, j)
+                    begin, behind = j + 1, j
+            _fill(row, begin, width, behind, _NONE)
 
 
-def boundary_offsets(labels: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H W"]:
-    """Offsets to boundaries by direction class: at pixel + offset + 1/2, or NO_BOUNDARY out of reach."""
-    out = np.empty((4, *labels.shape), np.int8)
-    _scan(_FOREGROUND, labels, out)
-    return out
+@no_type_check
+@numba.njit(cache=True, nogil=True, inline="always")
+def _fill(row: np.ndarray, begin: int, end: int, behind: int, ahead: int) -> None:
+    """Offsets of a stretch: to the boundary behind it up to the middle, then to the one ahead, where in reach."""
+    middle = min(max(min((ahead + behind + 1) // 2, behind + REACH_PX) + 1, begin), end)
+    near = min(max(ahead - REACH_PX, middle), end)
+    for k in range(begin, middle):
+        row[k] = behind - k
+    for k in range(middle, near):
+        row[k] = NO_BOUNDARY
+    for k in range(near, end):
+        row[k] = ahead - k
 
 
 def contrast_levels(
@@ -234,7 +263,7 @@ def prepare_maps(
     for f, o in enumerate(observations):
         is_road = labels[f] == _ROAD
         if o.steps_png is None:
-            _scan(_FOREGROUND, labels[f], offsets[f])
+            boundary_offsets(labels[f], offsets[f])
         else:
             offsets[f] = step_offsets(_decoded(o.steps_png))
             is_road = free_ground(o.lidar_drivable_xyz_m.astype(np.float64), camera, start)
@@ -256,9 +285,9 @@ def step_offsets(steps: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H W"]:
 
 def _along_rows(is_step: Bool[np.ndarray, "H W"]) -> Int8[np.ndarray, "H W"]:
     column = np.arange(is_step.shape[1])
-    behind = np.maximum.accumulate(np.where(is_step, column, -_FAR_PX), axis=1)
-    behind = np.pad(behind, ((0, 0), (1, 0)), constant_values=-_FAR_PX)[:, :-1] - column
-    ahead = np.minimum.accumulate(np.where(is_step, column, _FAR_PX)[:, ::-1], axis=1)[:, ::-1] - column
+    behind = np.maximum.accumulate(np.where(is_step, column, -_NONE), axis=1)
+    behind = np.pad(behind, ((0, 0), (1, 0)), constant_values=-_NONE)[:, :-1] - column
+    ahead = np.minimum.accumulate(np.where(is_step, column, _NONE)[:, ::-1], axis=1)[:, ::-1] - column
     nearest = np.where(2 * ahead + 1 < -2 * behind - 1, ahead, behind)
     return np.where(np.abs(nearest) <= REACH_PX, nearest, NO_BOUNDARY).astype(np.int8)
 

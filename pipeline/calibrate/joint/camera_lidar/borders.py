@@ -141,6 +141,7 @@ def _pull(
 
 # Standard deviation of the window in which paint has one direction or several: half of the widest blur. Not tuned.
 _AROUND_PX = 3.0
+_MARGIN_PX = 20  # rows that a window and its gradients reach, and more
 # Of finite differences: turns [rad], shifts [m], time [s], focal length; far below a pixel, far above rounding.
 _STEPS: Final = np.array([1e-4] * 3 + [1e-3] * 4 + [1e-4])
 
@@ -212,8 +213,12 @@ def _of_image(
     """`_gradients` of one image, by its structure tensor: where all gradients are parallel, there is a line."""
     height, width = contrast.shape
     inside = np.all((pixels >= 1) & (pixels < [width - 2, height - 2]), axis=1)  # NaN is outside
-    at = np.where(inside[:, None], pixels, 0.0).astype(np.float32)
-    values = contrast.astype(np.float32)
+    if not inside.any():
+        return np.zeros_like(pixels), np.zeros_like(pixels)
+    rows = pixels[inside, 1].astype(int)
+    first = max(rows.min() - _MARGIN_PX, 0)  # the road is in few of an image's rows
+    at = np.where(inside[:, None], pixels, 0.0).astype(np.float32) - np.array([0, first], np.float32)
+    values = contrast[first : rows.max() + _MARGIN_PX].astype(np.float32)
     by_u, by_v = (cv2.Sobel(values, cv2.CV_32F, *axis, ksize=3) / 8 for axis in ((1, 0), (0, 1)))
 
     def there(image: Float32[np.ndarray, "H W"]) -> np.ndarray:
