@@ -87,6 +87,7 @@ class CameraPrior:
     centre_sigma_px: float = 1.0
     # False = a default: enough to doubt a day, not enough to certify the camera's rotation.
     centre_is_stated: bool = False
+    stamp_sigma_s: float | None = None  # None = its clock is unknown
 
 
 class SensorPrior(Section):
@@ -132,10 +133,14 @@ class CameraTopics(_Sensor):
     )
     centre_sigma_px: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, exclude=True)
 
+    # 1-sigma accuracy of its stamps on the lidar's clock, where one clock is kept for both (PTP); by default, the clock
+    # is found with the mounting, which makes a camera that looks aside three times less sure.
+    stamp_sigma_s: Annotated[float, Field(gt=0, le=0.05)] | None = Field(default=None, exclude=True)
+
     @property
     def known(self) -> CameraPrior:
         """Prior knowledge of the camera for calibration."""
-        known = CameraPrior(self.readout_s, self.focal_sigma_relative)
+        known = CameraPrior(self.readout_s, self.focal_sigma_relative, stamp_sigma_s=self.stamp_sigma_s)
         if self.centre_sigma_px is None:
             return known
         return replace(known, centre_sigma_px=self.centre_sigma_px, centre_is_stated=True)

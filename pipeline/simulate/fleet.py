@@ -246,15 +246,20 @@ def fleet_toml(fleet: str, rigs: Mapping[str, RigSpec]) -> str:
 
 def _sections(rig: RigSpec) -> list[str]:
     head = f"[rigs.{rig.name}"
-    sections = [f"{head}.{s.kind}{'' if rig.is_short else f's.{s.name}'}]\n{_sensor(s)}" for s in rig.sensors]
+    stamps = "" if rig.stamp_sigma_s is None else f"stamp_sigma_s = {rig.stamp_sigma_s}\n"
+    sections = [
+        f"{head}.{s.kind}{'' if rig.is_short else f's.{s.name}'}]\n{_sensor(s)}{stamps if s.kind == 'camera' else ''}"
+        for s in rig.sensors
+    ]
     if not rig.is_short:
         first = [next((s.name for s in rig.of_kind(kind)), "") for kind in ("camera", "lidar", "radar")]
         three = f"three = {json.dumps(first)}\n" if all(first) else ""  # for training and its networks
         sections.insert(0, f'{head}]\nreference = "{rig.reference.name}"\nbase = "base_link"\n{three}')
+    sigmas = f"rotation_sigma_deg = 1.2\ntranslation_sigma_m = {rig.stated_translation_m}\n"
     return [
         *sections,
         f'{head}.ego]\nodometry = "{TOPICS["odometry"]}"\n',
-        f'{head}.prior]\nsource = "tf_static"\nrotation_sigma_deg = 1.2\ntranslation_sigma_m = 0.03\n',
+        f'{head}.prior]\nsource = "tf_static"\n{sigmas}',
     ]
 
 

@@ -31,17 +31,9 @@ STRAIGHT = np.radians([0.1, 0.3, -0.05])
 
 
 def tracks_of(
-    camera,
-    turn=STRAIGHT,
-    direction=(0.05, -0.02, 1.0),
-    way_m=3.0,
-    *,
-    seed=0,
-    noise_px=0.15,
-    traffic=0.0,
-    bonnet=0,
+    camera, turn=STRAIGHT, direction=(0.05, -0.02, 1.0), way_m=3.0, *, seed=0, noise_px=0.15, traffic=0.0, bonnet=0,
     readout=0.0,
-):
+):  # fmt: skip
     """Tracks of a static world, of road users, and of the car's own bonnet; true turn and direction midway.
 
     `readout` is of a rolling shutter, as a share of the time between both images.

@@ -102,11 +102,12 @@ def far_positions(
 
 
 def clock_alarms(
-    pairs: Mapping[str, PairEstimate], sigma_s: float, limits: ChecksConfig
+    pairs: Mapping[str, PairEstimate], sigmas_s: Mapping[str, float], limits: ChecksConfig
 ) -> dict[str, list[Check]]:
-    """Time offsets beyond `time_offset_sigma_s`, estimated or at the end of the search range."""
+    """Time offsets beyond their prior sigmas, estimated or at the end of the search range."""
     out = {}
     for pair, estimate in pairs.items():
+        sigma_s = sigmas_s[pair]
         dt_s, own_s, found = estimate.time_offset_s, estimate.time_offset_sigma_s or 0.0, estimate.diagnostics
         if dt_s is None:
             continue
@@ -167,8 +168,9 @@ def _constancy(day: FoundDay) -> Mapping[str, Sequence[Check]]:
 def _alarms(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     """Mountings and clocks many sigmas from their priors."""
     pairs = {p: e for p, e in day.solution.pairs.items() if e.frames_used}
-    sigma_s = day.fleet.solve.time_offset_sigma_s
-    found = [prior_alarms(pairs, day.prior, day.limits), clock_alarms(pairs, sigma_s, day.limits)]
+    sigmas_s = dict.fromkeys(PAIRS, day.fleet.solve.time_offset_sigma_s)
+    sigmas_s["camera_lidar"] = day.prior.camera.stamp_sigma_s or sigmas_s["camera_lidar"]
+    found = [prior_alarms(pairs, day.prior, day.limits), clock_alarms(pairs, sigmas_s, day.limits)]
     return {pair: [check for of in found for check in of.get(pair, ())] for pair in pairs}
 
 

@@ -138,7 +138,8 @@ class RigSpec:
         delay_sd_s: standard deviation (sd) per vehicle of each delay.
         sync_jitter_s: sd of the stamps of triggered sensors.
         prior_rotation_deg: sd per vehicle and sensor of the mounting against CAD, angle.
-        prior_translation_m: sd per axis.
+        prior_translation_m: sd per axis; fleet.toml states `stated_translation_m`.
+        stamp_sigma_s: of its cameras' stamps, as fleet.toml states it.
         remount_rotation_deg: sd per day and axis.
         remount_translation_m: sd per day and axis.
         behind_m: extent of the world behind the vehicle.
@@ -150,6 +151,8 @@ class RigSpec:
     sync_jitter_s: float = 0.0012
     prior_rotation_deg: float = 1.2
     prior_translation_m: float = 0.02
+    stated_translation_m: float = 0.03
+    stamp_sigma_s: float | None = None
     remount_rotation_deg: float = 0.02
     remount_translation_m: float = 0.002
     behind_m: float = 60.0

@@ -92,6 +92,12 @@ _VAN: Final = RigSpec(
     behind_m=150.0,
 )
 
+# The same as most that drive themselves: positions measured to 1 cm, one clock for cameras and lidars.
+_SURVEYED: Final = replace(
+    _VAN.changed(lambda s: s if s.kind == "radar" else replace(s, delay_s=0.0)), name="van-surveyed", delay_sd_s=0.0,
+    prior_translation_m=0.01, stated_translation_m=0.01, stamp_sigma_s=0.001, image_pairs=True,
+)  # fmt: skip
+
 # For the demo: as fast as a three-sensor rig.
 _DUO_SHEETS: Final[dict[str, Sheet]] = {
     "front": CameraSpec(608, 312),
@@ -198,6 +204,7 @@ _ALL: Final = (
     # Nose down, and twice as fast.
     _trio("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
     _VAN,
+    _SURVEYED,
     _DUO,
     _NO_LIDAR,
 )  # fmt: skip

@@ -8,9 +8,10 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.estimate import _usable, align_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.profiles import TimeOffsetProfile
-from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.core.config import SolveConfig
+from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD, clock_alarms
+from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.core.errors import SolveError
+from pipeline.core.rigs import CameraPrior
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import (
     change_between,
@@ -108,6 +109,17 @@ def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the
     assert np.abs(change[:3]).max() > 1e-6
     assert np.linalg.eigvalsh(e.covariance).min() > 0
     assert abs(e.time_offset_s - 0.03) < 3 * e.time_offset_sigma_s
+
+
+def test_stamps_of_a_clock_that_is_kept_are_right_and_a_wrong_word_about_them_is_named():
+    """The camera exposes 40 ms after the sweep; by default, its clock is expected to be 40 ms off."""
+    kept = replace(prior_off_by(2.0), camera=CameraPrior(stamp_sigma_s=0.001))
+    e = estimate_camera_lidar(traced_day(SPARSE, 12, seed=1, gaps_s=np.full(12, 0.04)), kept)
+    assert (e.time_offset_prior_s, e.time_offset_sigma_s <= 0.001) == (0.0, True)
+    assert np.abs(turn_and_sigma_deg(e)[0]).max() < 0.35
+    wrong = estimate_camera_lidar(traced_day(SPARSE, 12, seed=1, dt_s=0.03), kept)
+    alarms = [clock_alarms({"camera_lidar": x}, {"camera_lidar": 0.001}, ChecksConfig()) for x in (e, wrong)]
+    assert [[c.fault for of in found.values() for c in of] for found in alarms] == [[], ["time_offset"]]
 
 
 @pytest.mark.parametrize("walking_mps", [None, 1.0])

@@ -193,9 +193,13 @@ def test_a_position_left_to_the_prior_is_an_alarm_where_the_day_puts_it_elsewher
 
 def test_a_clock_that_is_further_off_than_stated_is_an_alarm():
     for dt_s, named in ((0.12, []), (-0.5, ["time_offset"]), (0.5, ["time_offset"])):
-        found = clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=dt_s)}, 0.05, LIMITS)
+        found = clock_alarms(
+            {"lidar_radar": estimate_of("lidar_radar", dt_s=dt_s)}, {"lidar_radar": 0.05}, LIMITS
+        )
         assert [c.fault for c in found.get("lidar_radar", [])] == named
-    assert not clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=0.5)}, 0.2, LIMITS)
+    assert not clock_alarms(
+        {"lidar_radar": estimate_of("lidar_radar", dt_s=0.5)}, {"lidar_radar": 0.2}, LIMITS
+    )
 
 
 @pytest.mark.parametrize(
@@ -205,7 +209,7 @@ def test_frames_that_align_far_better_at_another_offset_are_an_alarm_though_none
     own, is_alarm
 ):
     estimate = estimate_of("lidar_radar", own_dt_s=own[0], own_dt_z=own[1])
-    found = clock_alarms({"lidar_radar": estimate}, 0.05, LIMITS)
+    found = clock_alarms({"lidar_radar": estimate}, {"lidar_radar": 0.05}, LIMITS)
     assert [c.fault for c in found.get("lidar_radar", [])] == ["time_offset"] * is_alarm
 
 

@@ -81,7 +81,7 @@ class Aligned:
     basin: Basin
     state: AlignmentState
     kernel: KernelSettings
-    expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
+    expected_dt_s: float  # the state's time offset counts from it (`_expected_dt_s`)
     intrinsics: DayIntrinsics
     label_width_px: (
         float  # by which labels are wider than their objects, and the problem's edges moved outward
@@ -98,7 +98,7 @@ def align_camera_lidar(
     Args:
         observations: the day's frames; those with another camera or label size than the first are left out.
         prior: start, and weak information about pose; dt is expected to be the constant part of the stamps'
-            gaps, with `time_offset_sigma_s`.
+            gaps, with `time_offset_sigma_s`, or 0 with the camera's `stamp_sigma_s`.
         config: search box and resampling.
         rng: source of all random numbers.
 
@@ -106,6 +106,8 @@ def align_camera_lidar(
         SolveError: too few frames, or nothing to align in them.
     """
     used, rejected = _usable(observations)
+    if (stated_s := prior.camera.stamp_sigma_s) is not None:
+        config = config.model_copy(update={"time_offset_sigma_s": stated_s})
     heading_rad = None if prior.heading is None else prior.heading[0]
     velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
     if len(used) < _FEWEST_FRAMES:
@@ -124,16 +126,10 @@ def align_camera_lidar(
     sharp = sharp.in_view(basin.state.T_camera_lidar, MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
     sharp, kernel, basin, state = _refined(thin, sharp, terms, basin, scenes, rng)
     width_px = label_width_px(sharp, state.alone, kernel)
-    problem = CameraLidarProblem(
-        widened(sharp, state.T_camera_lidar, width_px),
-        prior,
-        config,
-        scenes,
-        int(rng.integers(2**32)),
-        prior.translation_sigma_m**2,
-    )
+    sharp, seed = widened(sharp, state.T_camera_lidar, width_px), int(rng.integers(2**32))
+    problem = CameraLidarProblem(sharp, prior, config, scenes, seed, prior.translation_sigma_m**2)
     intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
-    expected_dt_s = constant_gap_s(gaps_s(frames, "camera"))
+    expected_dt_s = _expected_dt_s(gaps_s(frames, "camera"), prior)
     return Aligned(problem, frames, rejected, basin, state, kernel, expected_dt_s, intrinsics, width_px)
 
 
@@ -191,15 +187,8 @@ def analyse_camera_lidar(
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
     own = np.sqrt(np.diag(analysis.covariance)[:2]).tolist()
-    turns = turns_by_parts(
-        aligned.frames,
-        problem.terms,
-        analysis.state,
-        analysis.kernel,
-        problem.scenes.block,
-        problem.seed,
-        own,
-    )
+    at, block = (analysis.state, analysis.kernel), problem.scenes.block
+    turns = turns_by_parts(aligned.frames, problem.terms, *at, block, problem.seed, own)
     parts = parts_of_alignment(problem, analysis, aligned.frames)
     return replace(_conclude(analysis, aligned, diagnostics, turns), parts=parts)
 
@@ -214,11 +203,16 @@ def _terms(
     reach, T = config.search_range(prior.sigmas).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
     readout_s, start = prior.camera.readout_s, Start(T, prior.rotation_sigma_rad)
     terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
-    terms = replace(terms, gap_s=terms.gap_s - constant_gap_s(terms.gap_s))  # so that dt is beyond it
+    terms = replace(terms, gap_s=terms.gap_s - _expected_dt_s(terms.gap_s, prior))  # so that dt is beyond it
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
         raise SolveError(because("few edges"))
     return terms
+
+
+def _expected_dt_s(gaps_s: np.ndarray, prior: Prior) -> float:
+    """Stamps of a clock that is kept are right; of an unknown one, a gap of all frames is an error of the clock."""
+    return constant_gap_s(gaps_s) if prior.camera.stamp_sigma_s is None else 0.0
 
 
 def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
@@ -297,7 +291,7 @@ def _conclude(
     dt_weight = 1 - (dt_sigma / expected_sigma) ** 2
     known = analysis.prior.camera
     notes = aligned.intrinsics.notes(known)
-    if dt_sigma > _UNKNOWN_SHARE * expected_sigma:
+    if known.stamp_sigma_s is None and dt_sigma > _UNKNOWN_SHARE * expected_sigma:
         notes.append(because("camera clock"))
     to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
     covariance = to_left @ analysis.covariance[:6, :6] @ to_left.T
