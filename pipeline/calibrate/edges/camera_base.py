@@ -55,6 +55,9 @@ _ROLL_FLOOR_RAD = np.radians(0.05)  # roads that lean to one side in bends
 # By which a body leans outward for each g: cars by 3 to 7 deg (Gillespie 1992), less where a road leans inward. The
 # real car leans by 7 to 8 in a bend of .36 g.
 _LEAN_RAD, _LEAN_SIGMA_RAD, _G_MPS2 = np.radians(5.0), np.radians(3.0), 9.81
+# By which roads turn a body up or down from image to image within one bend: .1 deg in 3 m is a crest of 1.7 km radius.
+# It passed for a roll of 2 to 7 deg in bends of 1 deg a pair (five days, all cameras alike).
+_HILL_RAD = np.radians(0.1)
 _CENTRE_RAD = np.radians(0.03)  # by principal point and focal length
 # Yaw of twelve side cameras (seeds 7423, 7427) was .09 deg RMS off beside its noise, mostly outward; less of those that
 # look ahead or back.
@@ -145,14 +148,14 @@ def estimate_camera_base(
     J[:3, :6] = changes_by_left(T)[:3]
     J[3, 6] = 1.0
     of_clock = np.inf if timed is None else timed.covariance[0, 0] + _CLOCK_FLOOR_S**2
-    weight = 1 / np.append(variance, of_clock)
+    weight, hills_rad = 1 / np.append(variance, of_clock), _by_hills(rows["roll"])
     sources = [(0, fits["roll"]), (1, fits["pitch"]), (2, fits["yaw"])]
     halves = [(axis, fit, float(STANCE[axis])) for axis, fit in sources]
     straight = np.flatnonzero(_is_straight(travel, T))
     series = Series(2, rows["yaw"], travel.scene[straight], travel.stamp_ns[straight], float(STANCE[2]))
     return EdgeEvidence(
         edge, inverse(T), 0.0 if timed is None else float(timed.value[0]), (J.T * weight) @ J,
-        np.zeros(7), _errors(edge, T), frames_used=len(travel.span_s), checks=_checks(edge, clock),
+        np.zeros(7), _errors(edge, T, hills_rad), frames_used=len(travel.span_s), checks=_checks(edge, clock),
         diagnostics=_numbers(travel, fits, clock), notes=_notes(fits, timed),
         others=other_scenes(T, halves), parts=first_and_last(T, series),
     )  # fmt: skip
@@ -300,13 +303,21 @@ def _checks(edge: Edge, clock: Regression | None) -> tuple[Check, ...]:
     return (Check(because("mirrored", camera=edge.parent.name), "orientation", disproves=True),)
 
 
-def _errors(edge: Edge, T: np.ndarray) -> Mapping[str, np.ndarray]:
-    """Biases by owner: the car's stance, the matching, the camera's intrinsics."""
+def _by_hills(roll: Rows) -> float:
+    """One sigma of the roll by turns, from hills that each bend has of its own [rad]."""
+    weight = roll.A[:, 0] / roll.sigma**2
+    of_bends = np.bincount(roll.block, weight)
+    return float(_HILL_RAD * np.linalg.norm(of_bends) / max(float(weight @ roll.A[:, 0]), 1e-9))
+
+
+def _errors(edge: Edge, T: np.ndarray, hills_rad: float) -> Mapping[str, np.ndarray]:
+    """Biases by owner: the car's stance, the matching, the camera's intrinsics, hills within turns."""
     matching = np.diag([_ROLL_FLOOR_RAD, _FLOOR_RAD, _FLOOR_RAD, 0.0, 0.0, 0.0])
     about = np.cross(T[:3, 2], [1.0, 0.0, 0.0])  # as long as the sine of the angle between view and travel
     aside = _ASIDE_RAD * np.append(about, np.zeros(3))[None]
     centre = Considered("centre", _CENTRE_RAD * np.eye(2, 6))
-    return by_sensor([*of_stance_and(T, matching=matching, aside=aside), centre], edge)
+    hills = Considered("hills", hills_rad * np.eye(1, 6))
+    return by_sensor([*of_stance_and(T, matching=matching, aside=aside), centre, hills], edge)
 
 
 def _numbers(

@@ -70,6 +70,7 @@ NUISANCES: Final = {
     # lidar-lidar and edges to the vehicle frame
     "matching": Nuisance(EDGE, "floors of `edges/`: between halves and days of vehicles that did not change"),
     "stance": Nuisance("base", "edges.on_base.STANCE: load, springs and toe"),
+    "hills": Nuisance("base", "edges.camera_base: roads that bend upward or downward within a turn"),
     "beams": Nuisance(EDGE, "edges.lidar_base: elevations of beams, where the road alone shows a tilt"),
     "ranges": Nuisance("lidar", "edges.lidar_base: ranges of the road"),
     "centre": Nuisance("camera", "edges.camera_base: principal point"),

@@ -102,6 +102,15 @@ def test_bends_to_one_side_leave_roll_as_unsure_as_the_lean_of_bodies():
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 
+def test_hills_within_bends_pass_for_roll_the_more_the_less_a_car_turns():
+    T, roll_deg = mounted(), {}
+    for turning in (0.25, 0.05):
+        base = estimate_camera_base(EDGE, day(T, turning=turning), start(T)).bias["base"]
+        roll_deg[turning] = np.degrees(np.sqrt(base[0, 0]))
+    assert 0.1 < roll_deg[0.25] < 0.5
+    assert roll_deg[0.05] > 3 * roll_deg[0.25]
+
+
 def test_the_way_between_two_images_is_that_of_a_path_that_begins_to_bend():
     T, span_s, speed, bends = mounted(), 0.5, 12.0, np.array([0.6, -0.4])  # rad/s^2
     s = np.linspace(-span_s / 2, span_s / 2, 4001)
