@@ -71,7 +71,7 @@ STUDY = $(ONE_THREAD) $(BIN)/python -m tests.benchmarks.studies
 benchmark: setup ## measure what the README's rows state on this commit, in about two hours on two cores
 	for study in table1 coverage worlds worlds-full worlds-motion starts faults; do \
 		$(STUDY).run $$study --root benchmark --workers $(WORKERS) || exit 1; done
-	{ $(STUDY).nights --root benchmark --fleets van no_lidar && $(STUDY).real --root benchmark \
+	{ $(STUDY).nights --root benchmark --fleets van surveyed no_lidar && $(STUDY).real --root benchmark \
 		&& $(STUDY).ssl --root benchmark --parts real --networks untrained trained; } & beside=$$!; \
 		$(STUDY).nights --root benchmark --fleets demo && $(STUDY).ssl --root benchmark --parts fleet; \
 		mine=$$?; wait $$beside && exit $$mine

@@ -1,6 +1,6 @@
 """Study: night after night of fleets, by the commands of a night: are records, poses and states right, is drift found?
 
-    python -m tests.benchmarks.studies.nights --root DAYS [--fleets demo van no_lidar] [--out RESULTS.jsonl]
+    python -m tests.benchmarks.studies.nights --root DAYS [--fleets demo van surveyed no_lidar] [--out RESULTS.jsonl]
 
 Each fleet of FLEETS is simulated day by day; `boresight nightly` runs after each day. Of every vehicle and night there
 is a line: its records and poses of that day, and the state that it would load, against the truth of that day, and the
@@ -82,6 +82,7 @@ class Fleet:
 FLEETS = {
     "demo": Fleet("demo", 7971, 6, 10, 40, "vehicle-2:6:radar:yaw:0.8,vehicle-5:6:camera:pitch:-0.5", True),
     "van": Fleet("van-pairs", 7972, 2, 3, 80, "vehicle-2:2:corner_rl:yaw:1.0"),
+    "surveyed": Fleet("van-surveyed", 7974, 2, 3, 80),
     "no_lidar": Fleet("no_lidar", 7973, 2, 3, 100),
 }
 
