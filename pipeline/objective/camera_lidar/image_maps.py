@@ -83,81 +83,33 @@ def boundary_offsets(
 ) -> Int8[np.ndarray, "4 H W"]:
     """Offsets to boundaries by direction class: at pixel + offset + 1/2, or NO_BOUNDARY out of reach."""
     out = np.empty((4, *labels.shape), np.int8) if out is None else out
-    differs = np.zeros(labels.shape, bool)  # NumPy compares 64 pixels at once
-    np.not_equal(labels[:, :-1], labels[:, 1:], out=differs[:, :-1])
-    _scan(_FOREGROUND, labels, np.flatnonzero(differs), np.flatnonzero(labels[:-1] != labels[1:]), out)
+    _fill_rows(_FOREGROUND, labels, _borders(labels), out[:2])
+    labels = cv2.transpose(labels)  # columns become rows: memory is read and written in its order
+    turned = np.empty((2, *labels.shape), np.int8)
+    _fill_rows(_FOREGROUND, labels, _borders(labels), turned)
+    for side in range(2):
+        cv2.transpose(turned[side], out[2 + side])
     return out
+
+
+def _borders(labels: np.ndarray) -> np.ndarray:
+    """Flat indices of pixels whose right neighbour has another label; NumPy compares 64 at once."""
+    differs = np.zeros(labels.shape, bool)
+    np.not_equal(labels[:, :-1], labels[:, 1:], out=differs[:, :-1])
+    return np.flatnonzero(differs)
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def _scan(
-    foreground: np.ndarray, labels: np.ndarray, beside: np.ndarray, below: np.ndarray, out: np.ndarray
-) -> None:
-    """Fill out[4, H, W] with offsets to the nearest boundary of each direction class along its axis.
-
-    Flat indices of pixels `beside` and `below` which another label lies. Sides of objects by stretches of each row;
-    tops and feet by one pass down and one up.
-    """
-    height, width = labels.shape
-    _fill_rows(foreground, labels, beside, out)
-    nearest = np.full((2, width), -_NONE, np.int16)
-    at = 0
-    for i in range(height):
-        for side in range(2):
-            _from_above(nearest[side], np.int16(i), out[2 + side, i])
-        while at < below.shape[0] and below[at] < (i + 1) * width:
-            _note_below(foreground, labels, i, below[at] - i * width, nearest)
-            at += 1
-    nearest[:] = _NONE
-    for i in range(height - 1, -1, -1):
-        while at > 0 and below[at - 1] >= i * width:
-            at -= 1
-            _note_below(foreground, labels, i, below[at] - i * width, nearest)
-        for side in range(2):
-            _from_below(nearest[side], np.int16(i), out[2 + side, i])
-
-
-@no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def _note_below(foreground: np.ndarray, labels: np.ndarray, i: int, j: int, nearest: np.ndarray) -> None:
-    """Note a boundary below row i, by the side of its foreground."""
-    near = foreground[labels[i, j], labels[i + 1, j]]
-    for side in range(2):
-        if near & (1 << side):
-            nearest[side, j] = i
-
-
-@no_type_check
-@numba.njit(cache=True, nogil=True)
-def _from_above(nearest: np.ndarray, row: int, out: np.ndarray) -> None:
-    """Offsets of a row to the last boundaries above it; a function of its own becomes vector instructions."""
-    for j in range(out.shape[0]):
-        n = np.int16(nearest[j] - row)
-        out[j] = n if n >= -REACH_PX else NO_BOUNDARY
-
-
-@no_type_check
-@numba.njit(cache=True, nogil=True)
-def _from_below(nearest: np.ndarray, row: int, out: np.ndarray) -> None:
-    """Offsets of a row to the boundaries below it where they are nearer: k + 1/2 ahead than -1/2 - k behind."""
-    for j in range(out.shape[0]):
-        n, before = np.int16(nearest[j] - row), np.int16(out[j])
-        is_nearer = (before == NO_BOUNDARY) | (np.int16(n + before) < -1)
-        out[j] = n if (n <= REACH_PX) & is_nearer else before
-
-
-@no_type_check
-@numba.njit(cache=True, nogil=True)
-def _fill_rows(foreground: np.ndarray, labels: np.ndarray, beside: np.ndarray, out: np.ndarray) -> None:
-    """Offsets along the rows, for every stretch between two boundaries of a class."""
+def _fill_rows(foreground: np.ndarray, labels: np.ndarray, borders: np.ndarray, out: np.ndarray) -> None:
+    """Fill out[2, H, W] with offsets along the rows, for every stretch between two boundaries of a class."""
     height, width = labels.shape
     for side in range(2):
         at = 0
         for i in range(height):
             row, begin, behind = out[side, i], 0, -_NONE
-            while at < beside.shape[0] and beside[at] < (i + 1) * width:
-                j = beside[at] - i * width
+            while at < borders.shape[0] and borders[at] < (i + 1) * width:
+                j = borders[at] - i * width
                 at += 1
                 if foreground[labels[i, j], labels[i, j + 1]] & (1 << side):
                     _fill(row, begin, j + 1, behind, j)

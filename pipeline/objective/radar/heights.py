@@ -160,6 +160,8 @@ class _Kinds:
     def __init__(self, day: _Detections) -> None:
         self.day = day
         self.stands = day.mirror.any(1)  # the lidar shows an object there, not bare road
+        # Points of bare road have no height: one stands for all of a detection's.
+        self.groups = (self.stands, day.mirror[self.stands]), (~self.stands, np.zeros((1, 1)))
         self.of = lru_cache(maxsize=4)(self._of)
 
     def _of(self, pitch: float, roll: float, log_sigma: float) -> tuple[np.ndarray, np.ndarray]:
@@ -167,8 +169,7 @@ class _Kinds:
         day, sigma = self.day, float(np.exp(log_sigma))
         turned = day.elevation - pitch * np.cos(day.azimuth) + roll * np.sin(day.azimuth)
         found = np.empty((3, len(turned)))
-        # Points of bare road have no height: one stands for all of a detection's.
-        for rows, mirror in ((self.stands, day.mirror[self.stands]), (~self.stands, np.zeros((1, 1)))):
+        for rows, mirror in self.groups:
             z, m = turned[rows, None] / sigma, mirror / sigma
             half = np.maximum(m, _NARROWEST)
             found[0, rows], found[1, rows] = (

@@ -179,8 +179,8 @@ def accumulate_frames(
         most_radar = max(most_radar, radar_first[f + 1] - radar_first[f])
     cells, inverse_cell = cells_of(sigma, max_range)
     seen, near, found = np.empty((5, most)), np.empty((8, most)), np.empty((4, most + 1))
-    order, cell = np.empty(most, np.int32), np.empty(most, np.int32)
-    start = np.empty(cells[0] * cells[1] + 2, np.int32)
+    order, cell, in_reach = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32)
+    start = np.empty(cells[0] * cells[1] + 3, np.int32)
     is_reached = np.empty(cells[0] * cells[1] + 1, np.uint8)
     sph, tells = np.empty((most_radar, 3)), np.empty(most_radar, np.bool_)
     J, sums, motion, mirror = np.empty((3, 8)), np.empty(8), np.empty(4), np.empty(3)
@@ -192,7 +192,9 @@ def accumulate_frames(
         motion[3] = yaw_rate[f] * tau[f]
         spherical(R, t, detections, limits, use_elevation[f], sph, tells)
         seen_by_radar(points, R, t, motion, range_bias, inverse_cell, cells, seen, cell)
-        count = sort_reached(sph[:m], sigma, inverse_cell, cells, cell[:n], is_reached, start, order)
+        count = sort_reached(
+            sph[:m], sigma, inverse_cell, cells, cell[:n], is_reached, start, in_reach, order
+        )
         # A mirror image lies twice its height along the road's normal below; the turn while tau turns that too.
         for k in range(3):
             mirror[k] = 2 * (R[0, k] * plane[f, 0] + R[1, k] * plane[f, 1] + R[2, k] * plane[f, 2])

@@ -116,8 +116,11 @@ def _reach(a, r, sigma, inverse_cell, cells):
 
 @no_type_check
 @_called
-def sort_reached(detections, sigma, inverse_cell, cells, cell, is_reached, start, order):
-    """Sort the points of the cells that detections (azimuth, elevation, range) reach; `start` is where cells begin."""
+def sort_reached(detections, sigma, inverse_cell, cells, cell, is_reached, start, in_reach, order):
+    """Sort the points of the cells that detections (azimuth, elevation, range) reach; `start` is where cells begin.
+
+    Returns their number; `in_reach` are the same, in the order of the points.
+    """
     start[:] = 0
     is_reached[:] = 0
     for k in range(detections.shape[0]):
@@ -125,19 +128,17 @@ def sort_reached(detections, sigma, inverse_cell, cells, cell, is_reached, start
         for i in range(i0, i1 + 1):
             for j in range(j0, j1 + 1):
                 is_reached[i * cells[1] + j] = 1
-    for k in range(cell.shape[0]):
-        start[cell[k] + 1] += is_reached[cell[k]]
+    count = 0
+    for k in range(cell.shape[0]):  # without a branch: most points are near no detection
+        in_reach[count] = k
+        count += is_reached[cell[k]]
+    for k in in_reach[:count]:
+        start[cell[k] + 2] += 1
     for c in range(start.shape[0] - 1):
         start[c + 1] += start[c]
-    count = start[start.shape[0] - 1]
-    for k in range(cell.shape[0]):
-        c = cell[k]
-        if is_reached[c]:
-            order[start[c]] = k
-            start[c] += 1
-    for c in range(start.shape[0] - 1, 0, -1):
-        start[c] = start[c - 1]
-    start[0] = 0
+    for k in in_reach[:count]:
+        order[start[cell[k] + 1]] = k
+        start[cell[k] + 1] += 1  # where the next cell begins, once all are placed
     return count
 
 
