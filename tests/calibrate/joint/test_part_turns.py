@@ -107,9 +107,16 @@ def test_boxes_show_by_how_much_a_pose_is_turned(turn_deg):
     poses = (T_CAMERA_LIDAR, from_rotation_translation(turn, np.zeros(3)) @ T_CAMERA_LIDAR)
     straight, turned = (box_offsets(day, np.repeat(T[None], len(day), axis=0)) for T in poses)
     assert set(turned[0].tolist()) == set(range(12))
-    medians = [np.degrees(np.median(offset, axis=0)) for _, offset in (straight, turned)]
+    medians = [np.degrees(np.median(offset, axis=0)) for _, offset, _ in (straight, turned)]
     assert np.abs(medians[0]).max() < 0.2  # faces that look away are in the box, not in the cloud
     np.testing.assert_allclose(medians[1] - medians[0], -np.array(turn_deg), atol=0.1)
+
+
+@pytest.mark.parametrize(("way", "axes"), [((10.0, 0.0, 0.0), [0, 1]), ((0.0, 10.0, 0.0), [])])
+def test_boxes_of_road_users_that_pass_across_the_view_take_no_part(way, axes):
+    day = make_day(16, seed=3)
+    poses, ways = np.tile(T_CAMERA_LIDAR[:3].reshape(1, 12), (16, 1)), np.tile(way, (16, 1))
+    assert [turn.axis for turn in parts._boxes(day, poses, ways, np.arange(16), 0)] == axes
 
 
 @pytest.mark.parametrize(("nats", "is_sure"), [(3.0, False), (30.0, True)])

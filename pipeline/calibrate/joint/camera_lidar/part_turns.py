@@ -60,6 +60,10 @@ _SIDES: Final = {
 _AXES: Final = ("pitch", "yaw")
 _FIT: Final = "the fit"
 _BOXES: Final = "boxes"
+# Angle by which a metre of a road user's way moves it across the view [rad/m]: where it was between sweep and image is
+# not known. Front cameras have .003 to .02. Of those that look aside, .02 to .2, yaw by boxes was up to 2.6 deg off at
+# the true pose, and pitch .2 (four days of vans, seeds 7423, 7431).
+_MOST_ACROSS_RADPM = 0.025
 _FEWEST_POINTS = 12
 _LEAST_PX = 12.0  # of a box, on either side, in the image of the labels' size
 _BORDER_PX = 4.0  # nearer to the image's border a road user may be cut
@@ -68,14 +72,9 @@ _Boxes = Float[np.ndarray, "_ 4"]  # u0 v0 u1 v1
 
 
 def turns_by_parts(
-    observations: Sequence[Observation],
-    terms: Terms,
-    state: AlignmentState,
-    kernel: KernelSettings,
-    blocks: Int[np.ndarray, " F"],
-    seed: int,
-    fit_sigma_rad: Sequence[float],
-) -> list[PartTurn]:
+    observations: Sequence[Observation], terms: Terms, state: AlignmentState, kernel: KernelSettings,
+    blocks: Int[np.ndarray, " F"], seed: int, fit_sigma_rad: Sequence[float],
+) -> list[PartTurn]:  # fmt: skip
     """Rotations about camera x and y by each side of the edges, its halves, the markings, and detected boxes alone.
 
     Each score's maximum within 2 deg, other unknowns unchanged, and the boxes' median; sigmas by resampling
@@ -107,7 +106,7 @@ def turns_by_parts(
         if kernel.marking_weight > 0 and len(terms.markings.xyz_m) >= _FEWEST:
             ask("paint", axis, terms.marking_score(at, kernel), _PAINT_FLOOR_PX * px_rad)
     fit = [PartTurn(_FIT, 0.0, fit_sigma_rad[axis], float(CAMERA_LIDAR_BIAS[axis]), axis) for axis in _SIDES]
-    return fit + found + _boxes(observations, terms.poses(state.alone)[0], blocks, seed)
+    return fit + found + _boxes(observations, terms.poses(state.alone)[0], terms.velocity_lidar, blocks, seed)
 
 
 def _most_offset_rad(edges: Points, px_rad: float) -> float:
@@ -122,16 +121,21 @@ def _by_height(edges: Points) -> dict[str, Points]:
 
 
 def _boxes(
-    observations: Sequence[Observation],
-    poses: Float[np.ndarray, "F 12"],
-    blocks: Int[np.ndarray, " F"],
-    seed: int,
-) -> list[PartTurn]:
-    """Rotation of the solution by boxes of a detector, which are independent of the label maps."""
+    observations: Sequence[Observation], poses: Float[np.ndarray, "F 12"],
+    velocity_lidar: Float[np.ndarray, "F 3"], blocks: Int[np.ndarray, " F"], seed: int,
+) -> list[PartTurn]:  # fmt: skip
+    """Rotation of the solution by boxes of a detector, which are independent of the label maps.
+
+    None of a camera that sees road users pass.
+    """
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3] = poses.reshape(-1, 3, 4)
-    frame, offset = box_offsets(observations, T)
-    if len(frame) < _FEWEST_BOXES:
+    frame, offset, centre = box_offsets(observations, T)
+    way, far_m = (T[frame, :3, :3] @ velocity_lidar[frame][..., None])[..., 0], np.linalg.norm(centre, axis=1)
+    sine = np.linalg.norm(np.cross(way, centre), axis=1) / np.maximum(
+        np.linalg.norm(way, axis=1) * far_m, 1e-9
+    )
+    if len(frame) < _FEWEST_BOXES or np.median(sine / far_m) > _MOST_ACROSS_RADPM:
         return []
     offset[:, 0] -= _BOX_PITCH_RAD
     rng, of_block = np.random.default_rng(seed), blocks[frame]
@@ -222,26 +226,24 @@ def _maximum(
 
 def box_offsets(
     observations: Sequence[Observation], T_camera_lidar: Float[np.ndarray, "F 4 4"]
-) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"]]:
-    """Rotations about the camera's x and y that move objects into their boxes [rad], and their frames.
+) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"], Float[np.ndarray, "M 3"]]:
+    """Frames of objects in boxes, rotations about the camera's x and y that move them there [rad], their places [m].
 
     `T_camera_lidar` is from each frame's lidar points to its image.
     """
-    frame, offset = list[int](), list[Float[np.ndarray, " 2"]]()
-    for k, (o, T) in enumerate(zip(observations, T_camera_lidar, strict=True)):
-        for moved in _frame_offsets(o, T):
-            frame.append(k)
-            offset.append(moved)
-    return np.array(frame, np.int64), np.array(offset, np.float64).reshape(-1, 2)
+    days = enumerate(zip(observations, T_camera_lidar, strict=True))
+    rows = [(k, *moved) for k, (o, T) in days for moved in _frame_offsets(o, T)]
+    frame, offset, centre = zip(*rows, strict=True) if rows else ((), (), ())
+    return np.array(frame, np.int64), np.array(offset).reshape(-1, 2), np.array(centre).reshape(-1, 3)
 
 
-def _frame_offsets(o: Observation, T: Float[np.ndarray, "4 4"]) -> Iterator[Float[np.ndarray, " 2"]]:
+def _frame_offsets(o: Observation, T: Float[np.ndarray, "4 4"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     camera, boxes = camera_of(o), o.road_user_boxes_px.astype(np.float64)
     size = np.array([camera.width_px, camera.height_px] * 2)
     least = _LEAST_PX / o.label_scale
     whole = (boxes[:, :2] > _BORDER_PX).all(1) & (boxes[:, 2:] < size[2:] - _BORDER_PX).all(1)
     boxes = boxes[whole & (boxes[:, 2:] - boxes[:, :2] > least).all(1)]
-    objects = _objects(o, T)
+    objects, centres = _objects(o, T)
     if not len(boxes) or not len(objects):
         return
     overlap = _overlap(boxes, objects)
@@ -250,19 +252,20 @@ def _frame_offsets(o: Observation, T: Float[np.ndarray, "4 4"]) -> Iterator[Floa
         rivals = np.concatenate([np.delete(row, c), np.delete(overlap[:, c], b)])
         if row[c] > _LEAST_OVERLAP and (not len(rivals) or rivals.max() < row[c] / 2):
             apart = (boxes[b, :2] + boxes[b, 2:] - objects[c, :2] - objects[c, 2:]) / 2
-            yield np.array([-apart[1] / camera.K[1, 1], apart[0] / camera.K[0, 0]])
+            yield np.array([-apart[1] / camera.K[1, 1], apart[0] / camera.K[0, 0]]), centres[c]
 
 
-def _objects(o: Observation, T: Float[np.ndarray, "4 4"]) -> _Boxes:
-    """Bounding box in the image of each lidar cluster."""
+def _objects(o: Observation, T: Float[np.ndarray, "4 4"]) -> tuple[_Boxes, Float[np.ndarray, "_ 3"]]:
+    """Bounding box in the image of each lidar cluster, and its middle in camera axes [m]."""
     xyz = o.lidar_map_xyz_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     uv, is_seen = camera_of(o).project(xyz)
-    found = []
+    found, centres = list[list[float]](), list[np.ndarray]()
     for c in range(len(o.lidar_cluster_centre_m)):
         of = o.lidar_map_cluster == c
         if of.sum() >= _FEWEST_POINTS and is_seen[of].all():
             found.append([*uv[of].min(0), *uv[of].max(0)])
-    return np.array(found, np.float64).reshape(-1, 4)
+            centres.append(xyz[of].mean(0))
+    return np.array(found, np.float64).reshape(-1, 4), np.array(centres, np.float64).reshape(-1, 3)
 
 
 def _overlap(a: _Boxes, b: _Boxes) -> Float[np.ndarray, "_ _"]:
