@@ -25,46 +25,27 @@ ONE = "my_car-1_2026-03-02_0"
 LAYOUTS = {
     "folders": (
         "{vehicle}/{day}/*.mcap",
-        [
-            f"{DAY}/a.mcap",
-            "car/2026-03-03/b.mcap",
-            "bus/2026-03-02/c.mcap",
-            f"{DAY}/notes.txt",
-            "car/latest/a.mcap",
-        ],
-        {
-            ("bus", "2026-03-02"): ["bus/2026-03-02/c.mcap"],
-            CAR: [f"{DAY}/a.mcap"],
-            ("car", "2026-03-03"): ["car/2026-03-03/b.mcap"],
-        },
-    ),
+        [f"{DAY}/a.mcap", "car/2026-03-03/b.mcap", "bus/2026-03-02/c.mcap", f"{DAY}/notes.txt", "car/latest/a.mcap"],
+        {("bus", "2026-03-02"): ["bus/2026-03-02/c.mcap"], CAR: [f"{DAY}/a.mcap"],
+         ("car", "2026-03-03"): ["car/2026-03-03/b.mcap"]}),
     "inside names, containers mixed": (
         "{vehicle}_{day}_*",
-        [f"{ONE}0.mcap", f"{ONE}1.bag", f"{ONE}2/metadata.yaml", f"{ONE}2/x.db3", f"{ONE}3/lost_metadata.db3"]
-        + ["my_car-1_2026-03-02_calibration.json", "my_car-1_2026-02-30_00.mcap"],
-        {("my_car-1", "2026-03-02"): [f"{ONE}0.mcap", f"{ONE}1.bag", f"{ONE}2", f"{ONE}3"]},
-    ),
+        [f"{ONE}0.mcap", f"{ONE}1.bag", f"{ONE}2/metadata.yaml", f"{ONE}2/x.db3", f"{ONE}3/lost_metadata.db3",
+         "my_car-1_2026-03-02_calibration.json", "my_car-1_2026-02-30_00.mcap"],
+        {("my_car-1", "2026-03-02"): [f"{ONE}0.mcap", f"{ONE}1.bag", f"{ONE}2", f"{ONE}3"]}),
     "a folder stands for its logs": (
-        "{vehicle}/{day}/",
-        [f"{DAY}/a.mcap", f"{DAY}/b.bag", f"{DAY}/readme.md"],
-        {CAR: [f"{DAY}/a.mcap", f"{DAY}/b.bag"]},
-    ),
+        "{vehicle}/{day}/", [f"{DAY}/{name}" for name in ("a.mcap", "b.bag", "readme.md")],
+        {CAR: [f"{DAY}/a.mcap", f"{DAY}/b.bag"]}),
     "a bag beside a ROS 2 recording": (
-        "{vehicle}/{day}",
-        [f"{DAY}/{name}" for name in ("metadata.yaml", "rec_0.mcap", "rec_1.mcap", "older.bag")],
-        {CAR: [DAY, f"{DAY}/older.bag"]},
-    ),
+        "{vehicle}/{day}", [f"{DAY}/{name}" for name in ("metadata.yaml", "rec_0.mcap", "rec_1.mcap", "older.bag")],
+        {CAR: [DAY, f"{DAY}/older.bag"]}),
     "a range of letters": (
-        "{vehicle}/{day}/a[0-1].mcap",
-        [f"{DAY}/{n}.mcap" for n in ("a0", "a1", "a2", "b0")],
-        {CAR: [f"{DAY}/a0.mcap", f"{DAY}/a1.mcap"]},
-    ),
+        "{vehicle}/{day}/a[0-1].mcap", [f"{DAY}/{n}.mcap" for n in ("a0", "a1", "a2", "b0")],
+        {CAR: [f"{DAY}/a0.mcap", f"{DAY}/a1.mcap"]}),
     "any letter": (
-        "{vehicle}/{day}/?0.mcap",
-        [f"{DAY}/{n}.mcap" for n in ("a0", "a1", "b0")],
-        {CAR: [f"{DAY}/a0.mcap", f"{DAY}/b0.mcap"]},
-    ),
-}
+        "{vehicle}/{day}/?0.mcap", [f"{DAY}/{n}.mcap" for n in ("a0", "a1", "b0")],
+        {CAR: [f"{DAY}/a0.mcap", f"{DAY}/b0.mcap"]}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("pattern", "files", "days"), LAYOUTS.values(), ids=LAYOUTS)

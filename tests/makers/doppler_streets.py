@@ -20,16 +20,9 @@ TEMPLATE = make_day(frames=1)[0]
 
 
 def scene(
-    rng,
-    *,
-    T=T_LIDAR_RADAR,
-    noise_deg=2.0,
-    mirrored=0.0,
-    displaced=0.0,
-    bias_deg=0.0,
-    curvature=0.0,
+    rng, *, T=T_LIDAR_RADAR, noise_deg=2.0, mirrored=0.0, displaced=0.0, bias_deg=0.0, curvature=0.0,
     speed=SPEED_MPS,
-):
+):  # fmt: skip
     """One frame: poles and kerbs; elevations are noisy, some are those of the image in the road, all may be off.
 
     `displaced` is the share that is seen, in direction and Doppler, anywhere between the thing and its image.

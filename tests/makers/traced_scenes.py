@@ -84,16 +84,9 @@ def _traced(rig, frames, seed, dt_s, reflective, gaps_s, readout_s):
 
 
 def traced_frame(
-    rig: Rig,
-    rng: np.random.Generator,
-    index: int,
-    speed_mps: float,
-    dt_s: float,
-    gap_s: float,
-    *,
-    reflective: bool,
-    readout_s: float = 0.0,
-) -> Observation:
+    rig: Rig, rng: np.random.Generator, index: int, speed_mps: float, dt_s: float, gap_s: float, *, reflective:
+    bool, readout_s: float = 0.0,
+) -> Observation:  # fmt: skip
     """One scene, seen by both sensors."""
     boxes, labels_of_box = scatter_boxes(rng)
     phase = rng.uniform(0, 12)

@@ -24,21 +24,13 @@ def terms(request):
     return prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=0.1).sharp()
 
 
+_K = np.array([[400.0, 0, 210], [0, 420.0, 95], [0, 0, 1]])
+_DISTORTED = [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003]
 CAMERAS = {
-    "pinhole": Camera(
-        "plumb_bob", np.array([[400.0, 0, 210], [0, 420.0, 95], [0, 0, 1]]), np.zeros(5), 420, 190
-    ),
-    "distorted": Camera(
-        "rational_polynomial",
-        np.array([[400.0, 0, 210], [0, 420.0, 95], [0, 0, 1]]),
-        np.array([-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003]),
-        420,
-        190,
-    ),
-    "f-theta": Camera(
-        "equidistant", np.array([[260.0, 0, 210], [0, 250.0, 95], [0, 0, 1]]), np.zeros(4), 420, 190
-    ),
-}
+    "pinhole": Camera("plumb_bob", _K, np.zeros(5), 420, 190),
+    "distorted": Camera("rational_polynomial", _K, np.array(_DISTORTED), 420, 190),
+    "f-theta": Camera("equidistant", np.array([[260.0, 0, 210], [0, 250.0, 95], [0, 0, 1]]), np.zeros(4), 420, 190),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
