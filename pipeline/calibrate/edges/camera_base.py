@@ -149,10 +149,10 @@ def estimate_camera_base(
     J[3, 6] = 1.0
     of_clock = np.inf if timed is None else timed.covariance[0, 0] + _CLOCK_FLOOR_S**2
     weight, hills_rad = 1 / np.append(variance, of_clock), _by_hills(rows["roll"])
-    sources = [(0, fits["roll"]), (1, fits["pitch"]), (2, fits["yaw"])]
-    halves = [(axis, fit, float(STANCE[axis])) for axis, fit in sources]
+    floors = np.hypot(STANCE[:3], _aside_rad(T))
+    halves = [(k, fits[name], float(floors[k])) for k, name in enumerate(("roll", "pitch", "yaw"))]
     straight = np.flatnonzero(_is_straight(travel, T))
-    series = Series(2, rows["yaw"], travel.scene[straight], travel.stamp_ns[straight], float(STANCE[2]))
+    series = Series(2, rows["yaw"], travel.scene[straight], travel.stamp_ns[straight], float(floors[2]))
     return EdgeEvidence(
         edge, inverse(T), 0.0 if timed is None else float(timed.value[0]), (J.T * weight) @ J,
         np.zeros(7), _errors(edge, T, hills_rad), frames_used=len(travel.span_s), checks=_checks(edge, clock),
@@ -310,11 +310,15 @@ def _by_hills(roll: Rows) -> float:
     return float(_HILL_RAD * np.linalg.norm(of_bends) / max(float(weight @ roll.A[:, 0]), 1e-9))
 
 
+def _aside_rad(T: np.ndarray) -> Float[np.ndarray, " 3"]:
+    """About axes of the base, as long as the sine of the angle between view and travel; each scene has its own."""
+    return np.asarray(_ASIDE_RAD * np.cross(T[:3, 2], [1.0, 0.0, 0.0]))
+
+
 def _errors(edge: Edge, T: np.ndarray, hills_rad: float) -> Mapping[str, np.ndarray]:
     """Biases by owner: the car's stance, the matching, the camera's intrinsics, hills within turns."""
     matching = np.diag([_ROLL_FLOOR_RAD, _FLOOR_RAD, _FLOOR_RAD, 0.0, 0.0, 0.0])
-    about = np.cross(T[:3, 2], [1.0, 0.0, 0.0])  # as long as the sine of the angle between view and travel
-    aside = _ASIDE_RAD * np.append(about, np.zeros(3))[None]
+    aside = np.append(_aside_rad(T), np.zeros(3))[None]
     centre = Considered("centre", _CENTRE_RAD * np.eye(2, 6))
     hills = Considered("hills", hills_rad * np.eye(1, 6))
     return by_sensor([*of_stance_and(T, matching=matching, aside=aside), centre, hills], edge)

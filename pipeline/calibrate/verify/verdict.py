@@ -174,24 +174,17 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[Check]:
     reach = np.sqrt(3) * search.rotation_rad
     ratio = np.abs(step) / result.prior_sigma
     worst = int(np.argmax(ratio))
+    shifted, moved = translation / search.translation_m, float(ratio[worst] / limits.max_move_prior_sigmas)
+    axis = because("far", axis=result.names[worst], ratio=ratio[worst])
     return [
         Check(
             because("far turn", off=np.degrees(rotation)),
+            "prior",
             margin=1 - rotation / reach,
             disproves=True,
-            fault="prior",
         ),
-        Check(
-            because("far shift", off=translation),
-            margin=1 - translation / search.translation_m,
-            disproves=True,
-            fault="prior",
-        ),
-        Check(
-            because("far", axis=result.names[worst], ratio=ratio[worst]),
-            margin=float(1 - ratio[worst] / limits.max_move_prior_sigmas),
-            fault="prior",
-        ),
+        Check(because("far shift", off=translation), "prior", margin=1 - shifted, disproves=True),
+        Check(axis, "prior", margin=1 - moved),
     ]
 
 
