@@ -55,7 +55,9 @@ _BEAMS = Considered("beams", np.radians(0.1) * np.eye(2, 6))
 _PAIRS_OF_TRAVEL = 20  # of sweeps: they show a way to .03 deg, as cameras do, at a third of the cost
 _AXLE_SIGMA_M = 1.5  # how far from the base the point may lie that follows the car's way: a wheelbase's half
 _NODS_SIGMA = np.radians(0.3)  # per m/s2, along and across: 3 deg/g
-_LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registration's
+# Of a way, beside what its registration states: bodies and roads. Weighed by its length, ways of motorways, some ten
+# centimetres off, outweighed those of towns: yaw of 29 days was .11 deg RMS off and at most .55, and is .06 and .14.
+_LEAST_RAD = np.radians(0.1)
 _AGAIN_RAD = np.radians(2.0)  # so far from the start the sweeps are looked at again
 _MEASURED_SIGMAS = 4.0
 _AXES = ("roll", "pitch", "yaw", "height")
@@ -196,11 +198,11 @@ def _rows(
     """Regressions on longitudinal and lateral acceleration and curvature; signs are those of the pose's change."""
     azimuth, elevation = travel.angles_rad.T
     one, free = np.ones(len(azimuth)), np.inf
-    block, sigma = travel.bend, 1 / np.minimum(travel.way_m, _LONGEST_WAY_M)
+    block, sigma = travel.bend, np.hypot(_LEAST_RAD, travel.sigma_rad)
     turning = np.stack([one, travel.curvature_radpm], 1)
     nodding = np.stack([one, travel.acceleration_mps2], 1)
-    yaw = Rows(turning, -azimuth, sigma, block, np.array([free, _AXLE_SIGMA_M]), one)
-    by_way = Rows(nodding, elevation, sigma, block, np.array([free, _NODS_SIGMA]), one)
+    yaw = Rows(turning, -azimuth, sigma[:, 0], block, np.array([free, _AXLE_SIGMA_M]), one)
+    by_way = Rows(nodding, elevation, sigma[:, 1], block, np.array([free, _NODS_SIGMA]), one)
     block, share = scenes.block[roads.moment], scenes.weight[roads.moment]
     one, sigma = np.ones((len(block), 1)), np.ones(len(block))
     across = (ego.velocity_mps[:, 0] * ego.yaw_rate_radps)[roads.moment]
