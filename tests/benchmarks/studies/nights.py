@@ -80,7 +80,7 @@ class Fleet:
 
 # Fresh seeds for each release: whoever changes the estimator on what they show draws new ones.
 FLEETS = {
-    "demo": Fleet("demo", 7971, 6, 10, 40, "vehicle-2:6:radar:yaw:0.8,vehicle-5:6:camera:pitch:-0.5", True),
+    "demo": Fleet("demo", 7981, 6, 10, 40, "vehicle-2:6:radar:yaw:0.8,vehicle-5:6:camera:pitch:-0.5", True),
     "van": Fleet("van-pairs", 7972, 2, 3, 80, "vehicle-2:2:corner_rl:yaw:1.0"),
     "surveyed": Fleet("van-surveyed", 7974, 2, 3, 80),
     "no_lidar": Fleet("no_lidar", 7973, 2, 3, 100),
