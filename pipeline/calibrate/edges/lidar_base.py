@@ -56,7 +56,7 @@ _PAIRS_OF_TRAVEL = 20  # of sweeps: they show a way to .03 deg, as cameras do, a
 _AXLE_SIGMA_M = 1.5  # how far from the base the point may lie that follows the car's way: a wheelbase's half
 _NODS_SIGMA = np.radians(0.3)  # per m/s2, along and across: 3 deg/g
 # Of a way, beside what its registration states: bodies and roads. Weighed by its length, ways of motorways, some ten
-# centimetres off, outweighed those of towns: yaw of 29 days was .11 deg RMS off and at most .55, and is .06 and .14.
+# centimetres off, outweighed those of towns: yaw of 30 days was .11 deg RMS off and at most .55, and is .06 and .14.
 _LEAST_RAD = np.radians(0.1)
 _AGAIN_RAD = np.radians(2.0)  # so far from the start the sweeps are looked at again
 _MEASURED_SIGMAS = 4.0
