@@ -17,7 +17,7 @@ from jaxtyping import Float, Int64
 
 from schemas.observations import Observation
 
-__all__ = ["constant_gap_s", "gaps_s", "motion_gates_ns", "scan_to_image_s", "turned"]
+__all__ = ["constant_gap_s", "expected_dt_s", "gaps_s", "motion_gates_ns", "scan_to_image_s", "turned"]
 
 # What is taken for a car that nobody measured, and for others that drive past one that stands.
 _UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
@@ -36,6 +36,11 @@ def gaps_s(observations: Sequence[Observation], sensor: str) -> Float[np.ndarray
 def constant_gap_s(gaps_s: Float[np.ndarray, " F"]) -> float:
     """The part of a sensor's gaps that all frames share [s]: their median; 0 without frames."""
     return float(np.median(gaps_s)) if len(gaps_s) else 0.0
+
+
+def expected_dt_s(gaps_s: Float[np.ndarray, " F"], stamp_sigma_s: float | None) -> float:
+    """Stamps of a clock that is kept are right; of an unknown one (None), a gap of all frames is its error [s]."""
+    return constant_gap_s(gaps_s) if stamp_sigma_s is None else 0.0
 
 
 def scan_to_image_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:

@@ -40,7 +40,7 @@ from pipeline.objective.radar.registration import (
     registration_cost,
     registration_frames,
 )
-from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
+from pipeline.objective.stamp_gaps import constant_gap_s, expected_dt_s, gaps_s
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import (
     change_jacobian,
@@ -113,12 +113,9 @@ def _camera_lidar(
         observations, estimate.T, velocity, reach_rad=reach, readout_s=readout_s, start=start
     )
     focal = estimate.diagnostics.get("focal_scale", 1.0)
-    # Of methods that estimate none: as if sensors of constant gaps measured together.
-    dt_s = (
-        constant_gap_s(gaps_s(observations, "camera"))
-        if estimate.time_offset_s is None
-        else estimate.time_offset_s
-    )
+    dt_s = estimate.time_offset_s
+    if dt_s is None:  # of methods that estimate none
+        dt_s = expected_dt_s(gaps_s(observations, "camera"), prior.camera.stamp_sigma_s)
     # The same points at every pose that is compared: rows that a prior a few degrees off would change by a tenth.
     terms = terms.telling().exposed_at(Alignments(estimate.T[None], np.array([dt_s]), np.array([focal])))
     terms = widened(terms, estimate.T, estimate.diagnostics.get("label_width_px", 0.0))

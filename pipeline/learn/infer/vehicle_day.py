@@ -17,7 +17,7 @@ from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day, likelihood
 from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
-from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
+from pipeline.objective.stamp_gaps import expected_dt_s, gaps_s
 from pipeline.rig.estimates import Check, PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from schemas.calibrations import PAIRS
@@ -97,7 +97,7 @@ def solve_by_networks(
     Args:
         observations: selected frames per pair; each is used for all pairs.
         networks: together they estimate each pair once.
-        clock_sigma_s: of the camera's clock against the lidar's.
+        clock_sigma_s: of the camera's clock against the lidar's, where the prior does not state it.
 
     Raises:
         SolveError: too few frames can be shown to the networks.
@@ -262,8 +262,8 @@ def _fitted_together(
     if which is None:
         return None
 
-    gap_s = gaps_s(asked.observations, "camera")
-    clock_s = constant_gap_s(gap_s)
+    gap_s, stated_s = gaps_s(asked.observations, "camera"), asked.prior.camera.stamp_sigma_s
+    clock_s = expected_dt_s(gap_s, stated_s)
     travels = [_travel(o, asked.prior) for o in asked.observations]
 
     def evidence(T: np.ndarray) -> list[FrameEvidence]:
@@ -273,7 +273,9 @@ def _fitted_together(
         return [replace(f, travel=travel, lag_s=lag_s) for f, travel, lag_s in moving if f is not None]
 
     block, pair = _blocks([o.drive for o in asked.observations]), "camera_lidar"
-    expected = Expected(asked.prior.of(pair), asked.prior.covariance(pair), clock_sigma_s, clock_s)
+    expected = Expected(
+        asked.prior.of(pair), asked.prior.covariance(pair), stated_s or clock_sigma_s, clock_s
+    )
     return fitted_day(evidence, block, candidates, expected)
 
 

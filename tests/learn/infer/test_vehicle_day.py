@@ -11,9 +11,10 @@ from jobs.cli import main
 from pipeline.calibrate.networks import held_if_unfit
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError, ModelError, SolveError
+from pipeline.core.rigs import CameraPrior
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.onnx_networks import UNFIT, model_files, models_key, open_networks
-from pipeline.learn.infer.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
+from pipeline.learn.infer.vehicle_day import FrameAnswer, _travel, single_frame_solution, solve_by_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.grid import NetworkConfig
@@ -82,15 +83,14 @@ def frames():
 def solve(frames, networks, prior, triggered=PAIRS, seed=0):
     observations, images = frames
     return solve_by_networks(
-        dict.fromkeys(PAIRS, observations),
-        prior,
-        networks=networks,
-        frames=lambda indices: iter([images[i] for i in indices]),
-        method="joint-ssl",
-        seed=seed,
-        clock_sigma_s=0.05,
-        triggered=triggered,
-    )
+        dict.fromkeys(PAIRS, observations), prior, networks=networks, triggered=triggered, method="joint-ssl",
+        frames=lambda indices: iter([images[i] for i in indices]), seed=seed, clock_sigma_s=0.05,
+    )  # fmt: skip
+
+
+def of_one_frame(frames, network, prior):
+    of_it = {"networks": [network], "method": "joint-ssl", "seed": 0}
+    return single_frame_solution(frames[1][3], frames[0][3], prior, **of_it)
 
 
 def errors_deg(solution):
@@ -123,9 +123,8 @@ def test_networks_that_only_repeat_their_guess_leave_every_prior(frames):
         solution = solve(frames, [Oracle(gain=1.0, noise=1e-3, composed=composed)], prior)
         for pair, estimate in solution.pairs.items():
             assert not estimate.observable.any(), pair
-            assert (
-                solution.loop_rotation_rad is None
-            ) == composed  # a loop closed by construction is no check
+            # A loop closed by construction is no check.
+            assert (solution.loop_rotation_rad is None) == composed
             assert pytest.approx(prior.of(pair), abs=1e-9) == estimate.T
 
 
@@ -158,16 +157,17 @@ def test_a_flat_radar_keeps_its_elevations(frames):
 
 
 def test_one_frame_is_a_calibration_with_the_sigma_of_one_frame(frames):
-    observations, images = frames
     prior = replace(prior_off(np.radians(5)), rotation_sigma_rad=np.radians(5))
-    network = Oracle(noise=0.02)  # one frame errs the same way at every guess: its noise is no scatter
-    found = single_frame_solution(
-        images[3], observations[3], prior, networks=[network], method="joint-ssl", seed=0
-    )
+    # One frame errs the same way at every guess: its noise is no scatter.
+    found = of_one_frame(frames, Oracle(noise=0.02), prior)
     estimate = found.pairs["camera_lidar"]
     assert np.abs(errors_deg(found)["camera_lidar"]).max() < 0.1
     assert estimate.frames_used == 1
     assert np.sqrt(estimate.covariance[0, 0]) > 0.8 * NOISE[0]
+
+
+def turn(azimuth_deg):
+    return exp_se3(np.array([0.0, np.radians(azimuth_deg), 0.0, 0.0, 0.0, 0.0]))
 
 
 class Alike(Oracle):
@@ -180,7 +180,7 @@ class Alike(Oracle):
 
     def answer(self, sensors, guess):
         found = super().answer(sensors, guess)
-        other = exp_se3(np.array([0.0, np.radians(5.0), 0.0, 0.0, 0.0, 0.0]))
+        other = turn(5.0)
         apart = log_se3(guess["camera_lidar"] @ inverse(TRUTH["camera_lidar"]))[1]
         if apart > np.radians(2.5):
             found.T["camera_lidar"] = other @ found.T["camera_lidar"]
@@ -188,13 +188,9 @@ class Alike(Oracle):
 
 
 def test_a_frame_that_looks_alike_from_two_places_cannot_tell_and_says_so(frames):
-    observations, images = frames
     for shift_deg in (2.0, 3.0):  # of the prior, from where most searches go to either place
-        shift = exp_se3(np.array([0.0, np.radians(shift_deg), 0.0, 0.0, 0.0, 0.0]))
-        prior = replace(Prior(shift @ T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05))
-        found = single_frame_solution(
-            images[3], observations[3], prior, networks=[Alike(noise=0.02)], method="joint-ssl", seed=0
-        )
+        prior = Prior(turn(shift_deg) @ T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
+        found = of_one_frame(frames, Alike(noise=0.02), prior)
         for pair in ("camera_lidar", "camera_radar"):
             assert not found.pairs[pair].observable.any()
             np.testing.assert_allclose(found.pairs[pair].T, prior.of(pair), atol=1e-6)
@@ -203,18 +199,31 @@ def test_a_frame_that_looks_alike_from_two_places_cannot_tell_and_says_so(frames
 
 
 def test_evidence_shows_at_which_of_two_places_a_search_ended_where_nothing_fits(frames):
-    observations, images = frames
     network = Alike(noise=0.02)
     network.shown = evidence_of(3)
-    shift = exp_se3(
-        np.array([0.0, np.radians(3.0), 0.0, 0.0, 0.0, 0.0])
-    )  # more than half end at the wrong place
-    prior = Prior(shift @ T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
-    found = single_frame_solution(
-        images[3], observations[3], prior, networks=[network], method="joint-ssl", seed=0
-    )
+    # More than half of the searches end at the wrong place.
+    prior = Prior(turn(3.0) @ T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
+    found = of_one_frame(frames, network, prior)
     assert found.pairs["camera_lidar"].observable[:3].all()
     assert np.abs(errors_deg(found)["camera_lidar"]).max() < 0.2
+
+
+@pytest.mark.parametrize("stamp_sigma_s", [None, 0.001])
+def test_stated_stamps_are_believed_and_others_are_errors_of_the_clock_until_frames_say_more(
+    frames, stamp_sigma_s
+):
+    """Each image was taken 50 ms after its sweep, and its stamp says so."""
+    late = [replace(o, camera_stamp_ns=o.stamp_ns + 50_000_000) for o in frames[0]]
+    prior = replace(prior_off(0.0), camera=CameraPrior(stamp_sigma_s=stamp_sigma_s))
+    ways = [_travel(o, prior) for o in late]
+    shown = [evidence_of(i, T_CAMERA_LIDAR @ exp_se3(-0.05 * way)) for i, way in enumerate(ways)]
+    network = Oracle()
+    network.evidence = lambda i, _T: shown[i]
+    found = solve((late, frames[1]), [network], prior).pairs["camera_lidar"]
+    assert found.time_offset_prior_s == pytest.approx(0.05 if stamp_sigma_s is None else 0.0)
+    assert found.time_offset_s == pytest.approx(0.0, abs=0.006)
+    assert (found.time_offset_sigma_s < 0.0011) == (stamp_sigma_s is not None)
+    assert np.abs(np.degrees(log_se3(found.T @ inverse(T_CAMERA_LIDAR))[:3])).max() < 0.12
 
 
 def exported(folder, *kinds):

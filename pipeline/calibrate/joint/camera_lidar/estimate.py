@@ -58,7 +58,7 @@ from pipeline.objective.camera_lidar.image_maps import Start
 from pipeline.objective.camera_lidar.label_width import label_width_px, widened
 from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
-from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
+from pipeline.objective.stamp_gaps import expected_dt_s, gaps_s
 from pipeline.rig.estimates import PairEstimate, Prior, common_part
 from pipeline.rig.se3 import change_jacobian
 from schemas.observations import Observation
@@ -81,7 +81,7 @@ class Aligned:
     basin: Basin
     state: AlignmentState
     kernel: KernelSettings
-    expected_dt_s: float  # the state's time offset counts from it (`_expected_dt_s`)
+    expected_dt_s: float  # the state's time offset counts from it (`stamp_gaps.expected_dt_s`)
     intrinsics: DayIntrinsics
     label_width_px: (
         float  # by which labels are wider than their objects, and the problem's edges moved outward
@@ -129,8 +129,8 @@ def align_camera_lidar(
     sharp, seed = widened(sharp, state.T_camera_lidar, width_px), int(rng.integers(2**32))
     problem = CameraLidarProblem(sharp, prior, config, scenes, seed, prior.translation_sigma_m**2)
     intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
-    expected_dt_s = _expected_dt_s(gaps_s(frames, "camera"), prior)
-    return Aligned(problem, frames, rejected, basin, state, kernel, expected_dt_s, intrinsics, width_px)
+    dt_s = expected_dt_s(gaps_s(frames, "camera"), stated_s)
+    return Aligned(problem, frames, rejected, basin, state, kernel, dt_s, intrinsics, width_px)
 
 
 def _refined(
@@ -203,16 +203,12 @@ def _terms(
     reach, T = config.search_range(prior.sigmas).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
     readout_s, start = prior.camera.readout_s, Start(T, prior.rotation_sigma_rad)
     terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
-    terms = replace(terms, gap_s=terms.gap_s - _expected_dt_s(terms.gap_s, prior))  # so that dt is beyond it
+    dt_s = expected_dt_s(terms.gap_s, prior.camera.stamp_sigma_s)
+    terms = replace(terms, gap_s=terms.gap_s - dt_s)  # so that the time offset is beyond it
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
         raise SolveError(because("few edges"))
     return terms
-
-
-def _expected_dt_s(gaps_s: np.ndarray, prior: Prior) -> float:
-    """Stamps of a clock that is kept are right; of an unknown one, a gap of all frames is an error of the clock."""
-    return constant_gap_s(gaps_s) if prior.camera.stamp_sigma_s is None else 0.0
 
 
 def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
