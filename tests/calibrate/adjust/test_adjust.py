@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
+from pipeline.calibrate.adjust.equations import Rig, equations_at
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.rig.estimates import EDGE, Check, EdgeEvidence
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
@@ -257,16 +257,6 @@ def test_the_equations_are_the_derivatives_of_the_cost():
         k = edges.index(e.evidence)
         at = [[equations_at(rig.moved(s * x), edges).edges[k].x for s in (1, -1)] for x in step * np.eye(20)]
         np.testing.assert_allclose(np.array([a - b for a, b in at]).T / (2 * step), e.J, atol=1e-6)
-
-
-def test_the_left_jacobian_is_that_of_finite_differences():
-    rng = np.random.default_rng(16)
-    for size in (0.0, 0.01, 0.2):
-        xi, step = size * rng.normal(size=6), 1e-6
-        J = left_jacobian_inverse(xi)
-        for k, d in enumerate(step * np.eye(6)):
-            plus, minus = (log_se3(exp_se3(s) @ exp_se3(xi)) for s in (d, -d))
-            np.testing.assert_allclose((plus - minus) / (2 * step), J[:, k], atol=1e-6)
 
 
 def test_it_does_not_matter_where_an_edge_was_linearised():

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
+from pipeline.calibrate.edges.lidar_base import _rows, estimate_lidar_base, road_under
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, estimate_lidar_lidar
+from pipeline.calibrate.edges.on_base import regress
+from pipeline.calibrate.edges.sweep_travel import SweepTravel
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.calibrate.verify.held_out import paired_test
 from pipeline.core.errors import SolveError
@@ -171,6 +174,21 @@ def test_a_measured_height_is_one_more_measurement_and_is_checked(street, eviden
     wrong = estimated(street, height_m=(height_m + 0.2, 0.01))
     assert any("height" in c.sentence for c in wrong.checks)
     assert by_axis(agreed)[0][2, 3] == pytest.approx(alone[2, 3], abs=0.01)
+
+
+def test_ways_of_motorways_that_lie_aside_do_not_outweigh_those_of_a_town():
+    rng, town = np.random.default_rng(5), np.arange(60) >= 10  # 250 m of motorway, and as much in town
+    way_m, none = np.where(town, 5.0, 25.0), np.zeros(60)
+    sigma_rad = np.where(town, 0.005, 0.1) / way_m  # by registration
+    azimuth_rad = np.where(town, rng.normal(0, np.radians(0.05), 60), sigma_rad)
+    velocity_mps = way_m[:, None] * np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad), none], 1)
+    turn_radps = np.outer(town * rng.uniform(-0.2, 0.2, 60), [0.0, 0.0, 1.0])
+    sigmas_rad = np.stack([sigma_rad, sigma_rad], 1)
+    travel = SweepTravel(np.arange(60), velocity_mps, turn_radps, way_m, none, sigmas_rad)
+    ego = EgoMotion(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3, 3)))
+    rows = _rows(travel, road_under([], np.eye(4), 0.0), ego, Scenes.of([]), 0.0)
+    yaw = regress(rows["yaw"])
+    assert abs(yaw.value[0]) < 3 * np.sqrt(yaw.covariance[0, 0]) < np.radians(0.1)
 
 
 def with_points(sweep, xyz_m):
