@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from onnx import numpy_helper
 from torch import Tensor, nn
 
 from pipeline.core.errors import ModelError
-from pipeline.learn.network.encoders import standardised
+from pipeline.learn.network.encoders import convolution, standardised
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Heads, Predictions
 from pipeline.learn.network.views import NetworkInputs, RenderedView, render
@@ -51,11 +51,9 @@ class ConcatCore(nn.Module):
         channels = {name: _CHANNELS[name] for name in _CHANNELS if any(name in pair for pair in pairs)}
         self.encoders = nn.ModuleDict({name: _encoder(c, width) for name, c in channels.items()})
         self.fusion = nn.Sequential(
-            nn.Conv2d(4 * width * len(channels), 6 * width, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(6 * width, 6 * width, 3, 2, 1),
-            nn.ReLU(),
-        )
+            nn.Conv2d(4 * width * len(channels), 6 * width, 3, 2, 1), nn.ReLU(),
+            nn.Conv2d(6 * width, 6 * width, 3, 2, 1), nn.ReLU(),
+        )  # fmt: skip
         # Where something is must survive: averages over 2 x 4 regions, as a product that every exporter knows.
         rows, columns = -(-grid.height // 64), -(-grid.width // 64)
         one_hot = torch.eye(rows * columns).reshape(-1, 1, rows, columns)
@@ -68,25 +66,12 @@ class ConcatCore(nn.Module):
         """Corrections and log variances from the sensors' grids at the current guess."""
         grids = {"camera": standardised(view.camera), "lidar": view.lidar_grid, "radar": view.radar_grid}
         maps = self.fusion(torch.cat([encoder(grids[name]) for name, encoder in self.encoders.items()], 1))
-        fused = self.last((maps.flatten(2) @ self.regions).flatten(1))
-        found = self.heads(fused)
-        identity = torch.eye(4, device=fused.device).expand(len(fused), 4, 4)
-        start = self.heads.start.expand(len(fused), 6)
-        corrections = [found[pair][0] if pair in found else identity for pair in PAIRS]
-        log_variance = [start + found[pair][1] if pair in found else start for pair in PAIRS]
-        return CoreOutputs(torch.stack(corrections, 1), torch.stack(log_variance, 1))
+        return CoreOutputs(*self.heads(self.last((maps.flatten(2) @ self.regions).flatten(1)), {}, {}))
 
 
 def _encoder(channels: int, width: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    sizes = (channels, width, 2 * width, 3 * width, 4 * width)
-    for inputs, outputs in pairwise(sizes):
-        layers += [
-            nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False),
-            nn.GroupNorm(max(1, outputs // 8), outputs),
-            nn.ReLU(),
-        ]
-    return nn.Sequential(*layers)
+    sizes = pairwise((channels, width, 2 * width, 3 * width, 4 * width))
+    return nn.Sequential(*(layer for inputs, outputs in sizes for layer in convolution(inputs, outputs, 2)))
 
 
 class CalibrationNetwork(nn.Module):
@@ -108,30 +93,22 @@ class CalibrationNetwork(nn.Module):
         likelihood: Tensor | None = None
         logits: Tensor | None = None
         for _ in range(iterations):
-            view, index = self._render(inputs)
+            view, index = render(inputs, self.config.grid, classes=self.config.takes_classes)
             if isinstance(self.core, MatchingCore) and found:
                 outputs = self.core.match(view, likelihood, logits)
             else:
                 outputs = self.core(view)
                 likelihood, logits = outputs.camera_log_likelihood, outputs.camera_logits
-            found.append(self._predictions(inputs, outputs, index))
+            evidence = outputs.evidence
+            if evidence is not None:
+                points_m = transform_points(inverse(inputs.T_camera_lidar), evidence.points_m)
+                evidence = replace(evidence, points_m=points_m)
+            poses = self._corrected(outputs.corrections, inputs)
+            found.append(Predictions(**vars(outputs) | {"evidence": evidence}, **poses, lidar_index=index))
             turns = outputs.corrections.detach().clone()
             turns[..., :3, 3] = 0.0
             inputs = replace(inputs, **self._corrected(turns, inputs))
         return found
-
-    def _render(self, inputs: NetworkInputs) -> tuple[RenderedView, Int64[Tensor, "B HW"]]:
-        return render(inputs, self.config.grid, classes=self.config.takes_classes)
-
-    def _predictions(
-        self, inputs: NetworkInputs, outputs: CoreOutputs, index: Int64[Tensor, "B HW"]
-    ) -> Predictions:
-        evidence = outputs.evidence
-        if evidence is not None:
-            points_m = transform_points(inverse(inputs.T_camera_lidar), evidence.points_m)
-            evidence = replace(evidence, points_m=points_m)
-        poses = self._corrected(outputs.corrections, inputs)
-        return Predictions(**vars(outputs) | {"evidence": evidence}, **poses, lidar_index=index)
 
     def _corrected(self, corrections: Float[Tensor, "B 3 4 4"], inputs: NetworkInputs) -> dict[str, Any]:
         """Corrected transforms (B 4 4) by the names of `NetworkInputs`.
@@ -143,11 +120,8 @@ class CalibrationNetwork(nn.Module):
         T_lidar_radar = corrections[:, 2] @ inputs.T_lidar_radar
         base = T_camera_lidar @ T_lidar_radar if self.config.composed else inputs.T_camera_radar
         T_camera_radar = corrections[:, 1] @ base
-        return {
-            "T_camera_lidar": T_camera_lidar,
-            "T_camera_radar": T_camera_radar,
-            "T_lidar_radar": T_lidar_radar,
-        }
+        poses = (T_camera_lidar, T_camera_radar, T_lidar_radar)
+        return {f"T_{pair}": T for pair, T in zip(PAIRS, poses, strict=True)}
 
 
 def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:

@@ -66,12 +66,9 @@ class ClassMatcher(nn.Module):
         return 2 * _STRIPS * (2 * self.levels[-1].reach + 1) ** 2
 
     def forward(
-        self,
-        log_likelihood: Float[Tensor, "B K H W"],
-        points_camera: Float[Tensor, "B N 3"],
-        probability: Float[Tensor, "B N K"],
-        weight: Float[Tensor, "B N"],
-    ) -> Match:
+        self, log_likelihood: Float[Tensor, "B K H W"], points_camera: Float[Tensor, "B N 3"],
+        probability: Float[Tensor, "B N K"], weight: Float[Tensor, "B N"],
+    ) -> Match:  # fmt: skip
         """Find the turn (and shift) of the points that fits best, in the optical frame; surfaces of the last level.
 
         Args:
@@ -148,11 +145,9 @@ class ClassMatcher(nn.Module):
         side = 2 * pad
         corner = corners.reshape(frames, 4, -1, side, side)
         return (
-            corner[:, 0, :, :-1, :-1]
-            + corner[:, 1, :, :-1, 1:]
-            + corner[:, 2, :, 1:, :-1]
-            + corner[:, 3, :, 1:, 1:]
-        )
+            corner[:, 0, :, :-1, :-1] + corner[:, 1, :, :-1, 1:]
+            + corner[:, 2, :, 1:, :-1] + corner[:, 3, :, 1:, 1:]
+        )  # fmt: skip
 
     def _turn(self, level: _Level, strips: Tensor, directions: Tensor, sharpness: Tensor) -> Tensor:
         """Rotation vector by soft-argmax over roll, elevation and azimuth shifts; all strips vote together."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
@@ -9,29 +11,41 @@ from torch.nn import functional as F  # noqa: N812 - the name that everybody use
 
 from pipeline.learn.sample.grid import CAMERA_CHANNELS
 
-__all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder", "cell_values"]
+__all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder", "cell_values", "convolution", "standardised"]
 
 _LEAST_LIKELIHOOD = 0.005  # a segmenter that is surer than one mistake in 200 cells is not believed
 
 
-class CameraEncoder(nn.Module):
-    """A mini U-net: 1/2 to 1/16 of the grid and back to 1/2, then logits for every cell by pixel shuffle.
+class _UNet(nn.Module):
+    """Halves the grid per width and doubles it again, to 1/2; then logits for every cell by pixel shuffle."""
+
+    def __init__(self, channels: int, classes: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        self.down = nn.ModuleList(_block(i, o, 2) for i, o in pairwise((channels, *widths)))
+        self.up = nn.ModuleList(_block(i + o, o, 1) for o, i in reversed(list(pairwise(widths))))
+        self.logits = nn.Conv2d(widths[0], 4 * classes, 1)
+
+    def features(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F h w"]:
+        """Convolutional features, by squares of four cells, with skip connections."""
+        skips = []
+        for block in self.down:
+            x = block(x)
+            skips.append(x)
+        for block, skip in zip(self.up, reversed(skips[:-1]), strict=True):
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+        return x
+
+
+class CameraEncoder(_UNet):
+    """A mini U-net: 1/2 to 1/16 of the grid and back.
 
     If the camera comes with classes, the output is added to their log-likelihood times a learned scale: a
     segmenter trained on photographs is right more often than a network trained on rendered images.
     """
 
     def __init__(self, classes: int, width: int, channels: int = CAMERA_CHANNELS) -> None:
-        super().__init__()
+        super().__init__(channels, classes, (width, 2 * width, 3 * width, 4 * width))
         self.trust = nn.Parameter(torch.ones(())) if channels > CAMERA_CHANNELS else None
-        w = (width, 2 * width, 3 * width, 4 * width)
-        self.down = nn.ModuleList(
-            [_block(channels, w[0], 2), _block(w[0], w[1], 2), _block(w[1], w[2], 2), _block(w[2], w[3], 2)]
-        )
-        self.up = nn.ModuleList(
-            [_block(w[3] + w[2], w[2], 1), _block(w[2] + w[1], w[1], 1), _block(w[1] + w[0], w[0], 1)]
-        )
-        self.logits = nn.Conv2d(w[0], 4 * classes, 1)
 
     def forward(self, camera: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
         """Logits per cell of the grid, whose sides are multiples of 16.
@@ -42,23 +56,18 @@ class CameraEncoder(nn.Module):
         x = standardised(camera[:, :CAMERA_CHANNELS])
         if self.trust is not None:
             x = torch.cat([x, camera[:, CAMERA_CHANNELS:]], 1)
-        x = _down_and_up(x, self.down, self.up)
-        logits = F.pixel_shuffle(self.logits(x), 2)
+        logits = F.pixel_shuffle(self.logits(self.features(x)), 2)
         if self.trust is None:
             return logits
         likelihood, known = camera[:, CAMERA_CHANNELS:-1], camera[:, -1:]
         return logits + self.trust * known * torch.log(likelihood.clamp(min=_LEAST_LIKELIHOOD))
 
 
-class LidarEncoder(nn.Module):
-    """Convolutions on the rendered sweep; logits for every cell by pixel shuffle."""
+class LidarEncoder(_UNet):
+    """Convolutions on the rendered sweep."""
 
     def __init__(self, channels: int, classes: int, width: int) -> None:
-        super().__init__()
-        w = (width, 2 * width, 3 * width)
-        self.down = nn.ModuleList([_block(channels, w[0], 2), _block(w[0], w[1], 2), _block(w[1], w[2], 2)])
-        self.up = nn.ModuleList([_block(w[2] + w[1], w[1], 1), _block(w[1] + w[0], w[0], 1)])
-        self.logits = nn.Conv2d(w[0], 4 * classes, 1)
+        super().__init__(channels, classes, (width, 2 * width, 3 * width))
         # What a point is depends first of all on itself: its own height, echo and range, cell by cell.
         self.own = nn.Sequential(
             nn.Conv2d(channels, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, classes, 1)
@@ -71,10 +80,6 @@ class LidarEncoder(nn.Module):
     def logits_of(self, features: Tensor, rendered: Tensor) -> Float[Tensor, "B K H W"]:
         """The same from the sweep's features."""
         return F.pixel_shuffle(self.logits(features), 2) + self.own(rendered)
-
-    def features(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F h w"]:
-        """Convolutional features of the sweep, by squares of four cells."""
-        return _down_and_up(rendered, self.down, self.up)
 
     def logits_at(
         self, features: Tensor, rendered: Tensor, row: Int64[Tensor, "B N"], column: Int64[Tensor, "B N"]
@@ -127,24 +132,11 @@ def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:
     return torch.cat([centred / torch.sqrt(variance + 1e-6), seen], 1)
 
 
-def _down_and_up(x: Tensor, down: nn.ModuleList, up: nn.ModuleList) -> Tensor:
-    """Halve the grid block by block, then double it, with skip connections."""
-    skips = []
-    for block in down:
-        x = block(x)
-        skips.append(x)
-    for block, skip in zip(up, reversed(skips[:-1]), strict=True):
-        x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
-    return x
-
-
 def _block(inputs: int, outputs: int, stride: int) -> nn.Sequential:
-    """Two 3 x 3 convolutions; group norm works at batch 1 and at any rig's statistics."""
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False),
-        nn.GroupNorm(max(1, outputs // 8), outputs),
-        nn.ReLU(),
-        nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False),
-        nn.GroupNorm(max(1, outputs // 8), outputs),
-        nn.ReLU(),
-    )
+    return nn.Sequential(*convolution(inputs, outputs, stride), *convolution(outputs, outputs, 1))
+
+
+def convolution(inputs: int, outputs: int, stride: int) -> tuple[nn.Module, ...]:
+    """Layers of a 3 x 3 convolution; group norm works at batch 1 and at any rig's statistics."""
+    norm = nn.GroupNorm(max(1, outputs // 8), outputs)
+    return nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), norm, nn.ReLU()

@@ -21,7 +21,6 @@ from pipeline.learn.sample.grid import (
     MARK_FLAT,
     MARK_LEAST_SHARE,
     MARKED_POINTS,
-    PAIRS,
     RADAR_FEATURES,
     NetworkConfig,
 )
@@ -36,10 +35,8 @@ _UNSEEN_WORTH = 0.2
 # What a lidar's encoder confuses on a car it never saw. On 18 frames of the real car started 2 deg off, azimuth was
 # 3.6 deg off on average without, for a few frames were 10 deg off, and 1.5 deg with (0.6, 0.3).
 _ALIKE = (
-    ("road", "verge"),
-    ("building", "fence", "pole", "vegetation"),
-    ("person", "vehicle", "two_wheeler"),
-)
+    ("road", "verge"), ("building", "fence", "pole", "vegetation"), ("person", "vehicle", "two_wheeler"),
+)  # fmt: skip
 _SOLID = (*_ALIKE[1], *_ALIKE[2])
 _CONFUSED_ALIKE, _CONFUSED_SOLID = 0.6, 0.3  # shares spread over classes of one kind, and of all objects
 _NO_BOUNDARY = 0.1  # likelihood of an edge where the image has no boundary: branches, kerbs, what labels miss
@@ -109,11 +106,9 @@ class MatchingCore(nn.Module):
         return torch.cat([continued, seen], 1)
 
     def match(
-        self,
-        view: RenderedView,
-        likelihood: Float[Tensor, "B L H W"] | None,
-        camera_logits: Float[Tensor, "B K H W"] | None = None,
-    ) -> CoreOutputs:
+        self, view: RenderedView, likelihood: Float[Tensor, "B L H W"] | None,
+        camera_logits: Float[Tensor, "B K H W"] | None,
+    ) -> CoreOutputs:  # fmt: skip
         """The part that depends on the guess: matchers, residuals, log variances."""
         bases: dict[str, Match] = {}
         lidar_logits = radar_logits = evidence = None
@@ -151,7 +146,8 @@ class MatchingCore(nn.Module):
             )
         features = [_features(base) for base in bases.values()]
         fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
-        corrections, log_variance = self._combine(bases, fused)
+        found = {pair: pose_of_twist(base.twist) for pair, base in bases.items()}
+        corrections, log_variance = self.heads(fused, found, self._log_variances(bases))
         logits_of = (camera_logits, lidar_logits, radar_logits)
         return CoreOutputs(corrections, log_variance, likelihood, *logits_of, evidence)
 
@@ -194,25 +190,14 @@ class MatchingCore(nn.Module):
         inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
         return row.long().clamp(0, height - 1), column.long().clamp(0, width - 1), inside
 
-    def _combine(self, bases: dict[str, Match], fused: Tensor) -> tuple[Tensor, Tensor]:
-        residuals = self.heads(fused)
+    def _log_variances(self, bases: dict[str, Match]) -> dict[str, Tensor]:
+        """Of the matchers, and of camera-radar by the other two where it is their product."""
         variances = {pair: base.variance for pair, base in bases.items()}
         if "camera_radar" not in bases and "camera_radar" in self.pairs:
             lidar_radar = variances["lidar_radar"]
             turned = [lidar_radar[:, [a + o for a in _AXES_CAMERA_OF_LIDAR]] for o in (0, 3)]
             variances["camera_radar"] = variances["camera_lidar"] + torch.cat(turned, -1)
-        identity = torch.eye(4, device=fused.device).expand(len(fused), 4, 4)
-        corrections, log_variance = [], []
-        for pair in PAIRS:
-            if pair not in self.pairs:
-                corrections.append(identity)
-                log_variance.append(self.heads.start.expand(len(fused), 6))
-                continue
-            residual, log_factor = residuals[pair]
-            base = pose_of_twist(bases[pair].twist) if pair in bases else identity
-            corrections.append(residual @ base)
-            log_variance.append(torch.log(variances[pair]) + log_factor)
-        return torch.stack(corrections, 1), torch.stack(log_variance, 1)
+        return {pair: torch.log(variance) for pair, variance in variances.items()}
 
 
 def _confusions() -> Float[Tensor, "K K"]:

@@ -52,9 +52,8 @@ class OccupancyMatcher(nn.Module):
         nn.init.zeros_(self.weigh.bias)
         self.register_buffer("yaws", _steps(_YAW_STEP_DEG), persistent=False)
         self.register_buffer("pitches", _steps(_PITCH_STEP_DEG), persistent=False)
-        self.register_buffer(
-            "rolls", torch.tensor(_ROLLS_DEG * degree, dtype=torch.float32), persistent=False
-        )
+        rolls = torch.tensor(_ROLLS_DEG * degree, dtype=torch.float32)
+        self.register_buffer("rolls", rolls, persistent=False)
 
     @property
     def surface_size(self) -> int:

@@ -22,14 +22,11 @@ _LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
 class ClassEvidence:
     """Matching evidence of camera and lidar, with gradients to both encoders: points, then marks."""
 
-    maps: Float[
-        Tensor, "B K H W"
-    ]  # log-likelihood of classes, and of boundaries and paint if these are matched
+    maps: Float[Tensor, "B K H W"]  # log-likelihood of classes, and of boundaries and paint if matched
     probability: Float[Tensor, "B N K"]  # of each point's classes
     worth: Float[Tensor, "B N"]
-    points_m: Float[
-        Tensor, "B N 3"
-    ]  # of CoreOutputs: optical frame at the guess; of Predictions: lidar frame
+    # Of CoreOutputs: in the optical frame at the guess; of Predictions: in the lidar frame.
+    points_m: Float[Tensor, "B N 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +40,8 @@ class CoreOutputs:
 
     corrections: Float[Tensor, "B 3 4 4"]
     log_variance: Float[Tensor, "B 3 6"]
-    camera_log_likelihood: Float[Tensor, "B L H W"] | None = (
-        None  # of K classes, and whether the cell is seen
-    )
+    # Of K classes, and whether the cell is seen.
+    camera_log_likelihood: Float[Tensor, "B L H W"] | None = None
     camera_logits: Float[Tensor, "B K H W"] | None = None
     lidar_logits: Float[Tensor, "B K H W"] | None = None
     radar_logits: Float[Tensor, "B M K"] | None = None
@@ -80,15 +76,20 @@ class Heads(nn.Module):
         self.register_buffer("start", torch.tensor(_LOG_VARIANCE), persistent=False)
 
     def forward(
-        self, features: Float[Tensor, "B F"]
-    ) -> dict[str, tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 6"]]]:
-        """By pair: left correction, and the change of its log variance from the start."""
-        found = {}
-        for pair, layer in self.layers.items():
-            raw = layer(features)
-            step = raw[:, :6] * self.unit
-            found[pair] = pose_of_euler_angles(step[:, :3], step[:, 3:]), raw[:, 6:]
-        return found
+        self, features: Float[Tensor, "B F"], bases: dict[str, Tensor], log_variances: dict[str, Tensor]
+    ) -> tuple[Float[Tensor, "B 3 4 4"], Float[Tensor, "B 3 6"]]:
+        """Corrections and log variances of all PAIRS: changes of those found so far, if there are any."""
+        corrections, spreads = [], []
+        for pair in PAIRS:
+            correction = torch.eye(4, device=features.device).expand(len(features), 4, 4)
+            spread = log_variances.get(pair, self.start.expand(len(features), 6))
+            if pair in self.layers:
+                raw = self.layers[pair](features)
+                step = raw[:, :6] * self.unit
+                correction, spread = pose_of_euler_angles(step[:, :3], step[:, 3:]), spread + raw[:, 6:]
+            corrections.append(correction @ bases[pair] if pair in bases else correction)
+            spreads.append(spread)
+        return torch.stack(corrections, 1), torch.stack(spreads, 1)
 
 
 def pose_of_twist(twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4 4"]:

@@ -153,7 +153,5 @@ def grid_cells(
 ) -> tuple[Float[Tensor, "B N"], Float[Tensor, "B N"]]:
     """Row and column of directions as fractions of cells: cell (i, j) spans i..i+1, j..j+1."""
     cell = np.radians(grid.cell_deg)
-    return (
-        (np.radians(grid.top_deg) - angles[..., 1]) / cell,
-        (np.radians(grid.left_deg) - angles[..., 0]) / cell,
-    )
+    row = (np.radians(grid.top_deg) - angles[..., 1]) / cell
+    return row, (np.radians(grid.left_deg) - angles[..., 0]) / cell
