@@ -19,7 +19,7 @@ from pipeline.core.config import load_fleet
 from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.prepare.survey import reference_of, usable_records
 from pipeline.learn.sample.frame_sample import About, make_row
-from pipeline.learn.train.frame_objective import FrameObjective, frame_objective, weighted
+from pipeline.learn.train.frame_objective import FrameObjective, weighted
 from pipeline.learn.train.settings import LossConfig
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.se3 import exp_so3
@@ -81,7 +81,7 @@ def minima(
     batch: TrainingBatch, truth: dict[str, np.ndarray], weights: LossConfig, dofs: Sequence[int] = range(6)
 ) -> dict[str, list[Minimum]]:
     """By pair, of the weighted sum of its terms: the minimum along degrees of freedom."""
-    objective = [frame_objective(batch[slice(i, i + 8)]) for i in range(0, len(batch), 8)]
+    objective = [FrameObjective(batch[slice(i, i + 8)]) for i in range(0, len(batch), 8)]
     found: dict[str, list[Minimum]] = {pair: [] for pair in PAIRS}
     for dof in dofs:
         offsets = STEPS * TOLERANCE[dof]

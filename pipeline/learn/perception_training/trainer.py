@@ -17,19 +17,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.core.config import FleetConfig
-from pipeline.core.errors import ConfigError, ContractError
+from pipeline.core.errors import ContractError
 from pipeline.core.results import Progress, silent
 from pipeline.core.rows import join_rows, take_rows
 from pipeline.learn.export.onnx_file import trace_to_onnx, write_card
-from pipeline.learn.train.loop import (
-    LAST,
-    MetricsLog,
-    Run,
-    TrainResult,
-    load_checkpoint,
-    run_loop,
-    stop_signals,
-)
+from pipeline.learn.train.loop import MetricsLog, Run, TrainResult, run_loop, stop_signals
 from pipeline.learn.train.settings import Count, DescentConfig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived_days
@@ -161,8 +153,7 @@ def train_network(
         network = task.network(config.width)
     out.mkdir(parents=True, exist_ok=True)
     run = _TaskRun(network, taught, config)
-    if (out / LAST).exists():
-        run.resume(out / LAST)
+    run.resume(out)
     with stop_signals() as stops, closing(MetricsLog(out, run.step, events=False)) as log:
         result = run_loop(run, out, log, stops, time_limit_s, progress)
         scores = taught.scores(network.eval(), samples.held_out)
@@ -197,7 +188,7 @@ def export_model(
 class _TaskRun(Run):
     def __init__(self, network: nn.Module, task: Task[R], config: TrainingConfig) -> None:
         super().__init__(network, config, config.steps)
-        self.task, self.config = task, config
+        self.task = task
         digest = hashlib.sha256()
         for array in vars(task.train).values():
             if isinstance(array, np.ndarray):
@@ -205,20 +196,15 @@ class _TaskRun(Run):
         self.data_key = digest.hexdigest()[:16]
 
     def losses(self) -> dict[str, Tensor]:
-        rng = np.random.default_rng([self.config.seed, self.step])
+        rng = np.random.default_rng([self.descent.seed, self.step])
         train = self.task.train
-        batch = take_rows(train, rng.integers(0, len(train), self.config.batch_size))
+        batch = take_rows(train, rng.integers(0, len(train), self.descent.batch_size))
         return {"loss": self.task.loss(self.network, batch, rng)}
 
     def state(self) -> dict[str, Any]:
-        return super().state() | {"config": self.config.model_dump(), "data_key": self.data_key}
+        return super().state() | {"data_key": self.data_key}
 
-    def resume(self, path: Path) -> None:
-        """Continue from a checkpoint."""
-        state = load_checkpoint(path)
-        if state["config"] != self.config.model_dump():
-            problem = f"this run was begun with {state['config']}: take another folder"
-            raise ConfigError(str(path), "", problem)
+    def load(self, state: dict[str, Any]) -> None:
         if state["data_key"] != self.data_key:
-            raise ContractError(str(path), "this run was begun on other samples: take another folder")
-        self.load(state)
+            raise ContractError(self.task.name, "this run was begun on other samples: take another folder")
+        super().load(state)

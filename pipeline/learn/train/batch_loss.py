@@ -15,23 +15,18 @@ from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.network.views import NetworkInputs, crop, grid_cells, sensor_inputs, sphere
 from pipeline.learn.sample.grid import PAIRS, Grid
 from pipeline.learn.train.domain_randomisation import Guess, made_strange, mirrored, random_guess, turned_view
-from pipeline.learn.train.frame_objective import (
-    at_lag,
-    frame_objective,
-    twist_between,
-    uncertainty_loss,
-    weighted,
-)
+from pipeline.learn.train.frame_objective import FrameObjective, at_lag, twist_between, weighted
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
 from pipeline.objective.differentiable.projection import GridProjection, pose, transform_points
 from pipeline.objective.differentiable.terms import class_evidence_cost
 from schemas.training import UNKNOWN_CLASS
 
-__all__ = ["Passes", "batch_loss", "class_of_points", "semantics_loss"]
+__all__ = ["Passes", "batch_loss", "class_of_points", "semantics_loss", "uncertainty_loss"]
 
 _DEG = 180.0 / torch.pi
 _RADAR_WEIGHT = 0.2  # of semantics: a detection's features hardly determine its class
+_LOG_VARIANCE = (-18.0, 2.0)  # sigmas of 0.1 mrad to 3 m: what lies beyond has no gradient
 
 
 class Passes(nn.Module):
@@ -90,14 +85,11 @@ def batch_loss(
 
 
 def _alignment(
-    answers: list[Predictions],
-    guess: Guess,
-    batch: TrainingBatch,
-    config: TrainConfig,
+    answers: list[Predictions], guess: Guess, batch: TrainingBatch, config: TrainConfig,
     paper: PaperFrames | None,
-) -> tuple[Tensor, dict[str, Tensor]]:
+) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
     """Loss of the answers, mean over frames and passes, and the terms of the last pass."""
-    objective, pairs = None if paper else frame_objective(batch), PAIRS_OF[config.pairs]
+    objective, pairs = None if paper else FrameObjective(batch), PAIRS_OF[config.pairs]
     total = torch.zeros((), device=batch.T_camera_lidar.device)
     terms: dict[str, Tensor] = {}
     for answer in answers:
@@ -117,14 +109,10 @@ def _alignment(
 def _semantics(answers: list[Predictions], view: TrainingBatch, turned: Tensor, grid: Grid) -> Tensor:
     """Cross-entropy of the encoders; the reference carries the classes to points as the image saw them."""
     grid_class = crop(view.grid_class, view.grid_step_deg, grid)
-    lidar = at_lag(view, view.lidar_xyz_m, view.camera_lag_s)
-    of_points = [
-        class_of_points(grid_class, transform_points(turned @ T, xyz), valid, grid)
-        for T, xyz, valid in (
-            (view.T_camera_lidar, lidar, view.lidar_valid),
-            (view.T_camera_radar, view.radar_xyz_m, view.radar_valid),
-        )
-    ]
+    lidar = transform_points(turned @ view.T_camera_lidar, at_lag(view, view.lidar_xyz_m, view.camera_lag_s))
+    radar = transform_points(turned @ view.T_camera_radar, view.radar_xyz_m)
+    clouds = ((lidar, view.lidar_valid), (radar, view.radar_valid))
+    of_points = [class_of_points(grid_class, *cloud, grid) for cloud in clouds]
     # The camera's logits are the same in all passes; the lidar is rendered anew in each.
     return torch.stack([semantics_loss(a, grid_class, *of_points) for a in answers]).mean()
 
@@ -144,11 +132,9 @@ def _evidence(
 
 
 def class_of_points(
-    grid_class: UInt8[Tensor, "B H W"],
-    points_camera: Float[Tensor, "B N 3"],
-    valid: Bool[Tensor, "B N"],
+    grid_class: UInt8[Tensor, "B H W"], points_camera: Float[Tensor, "B N 3"], valid: Bool[Tensor, "B N"],
     grid: Grid,
-) -> Int64[Tensor, "B N"]:
+) -> Int64[Tensor, "B N"]:  # fmt: skip
     """Class of the cell that each point falls into; UNKNOWN_CLASS outside the grid."""
     row, column = grid_cells(sphere(points_camera), grid)
     inside = valid & (points_camera[..., 2] > 0.5) & (row >= 0) & (column >= 0)
@@ -159,11 +145,9 @@ def class_of_points(
 
 
 def semantics_loss(
-    predictions: Predictions,
-    grid_class: UInt8[Tensor, "B H W"],
-    lidar_class: Int64[Tensor, "B N"],
+    predictions: Predictions, grid_class: UInt8[Tensor, "B H W"], lidar_class: Int64[Tensor, "B N"],
     radar_class: Int64[Tensor, "B M"],
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """Cross-entropy of all encoders of one pass, 0 without any; `grid_class` is cropped as the image was."""
     loss = torch.zeros((), device=grid_class.device)
     if predictions.camera_logits is not None:
@@ -182,3 +166,11 @@ def semantics_loss(
 def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
     known = (target != UNKNOWN_CLASS).sum().clamp(min=1)
     return F.cross_entropy(logits.float(), target, ignore_index=UNKNOWN_CLASS, reduction="sum") / known
+
+
+def uncertainty_loss(
+    log_variance: Float[Tensor, "B 3 6"], scatter: Float[Tensor, "B 3 6"]
+) -> Float[Tensor, ""]:
+    """Negative log-likelihood of the scatter; only the variances learn from it, because the scatter has no gradient."""
+    bounded = log_variance.clamp(*_LOG_VARIANCE)
+    return 0.5 * (scatter.square() * torch.exp(-bounded) + bounded).mean()

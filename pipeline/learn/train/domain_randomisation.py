@@ -49,30 +49,27 @@ _NEARER = 1.0  # trees 15 m away were taken for lorries, as simulated trees stan
 def made_strange(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
     """The sensors with all configured randomisations."""
     camera, classes = sensors.camera, sensors.classes
+    draw = _Draw(generator, camera.device)
     if config.classes > 0:
-        classes = _strange_classes(classes, config.classes, generator)
+        classes = _strange_classes(classes, config.classes, draw)
     if config.image > 0:
-        camera = _strange_image(camera, sensors.classes, config.image, generator)
-    without = _chosen(len(camera), config.no_classes, generator, camera.device)
+        camera = _strange_image(camera, sensors.classes, config.image, draw)
+    without = draw.even(len(camera)) < config.no_classes
     classes = classes * (~without)[:, None, None, None]
-    blank = _chosen(len(camera), config.no_image, generator, camera.device) & ~without
+    blank = (draw.even(len(camera)) < config.no_image) & ~without
     colours = camera[:, : CAMERA_CHANNELS - 1] * (~blank)[:, None, None, None]
     camera = torch.cat([colours, camera[:, CAMERA_CHANNELS - 1 :]], 1)
     sensors = replace(sensors, camera=camera, classes=classes)
     if config.lidar > 0 or config.fewer_rows > 0:
-        sensors = _strange_lidar(sensors, config, generator)
+        sensors = _strange_lidar(sensors, config, draw)
     return sensors
 
 
 def _strange_image(
-    camera: Float[Tensor, "B 4 H W"],
-    classes: Float[Tensor, "B C H W"],
-    strength: float,
-    generator: torch.Generator,
+    camera: Float[Tensor, "B 4 H W"], classes: Float[Tensor, "B C H W"], strength: float, draw: _Draw
 ) -> Float[Tensor, "B 4 H W"]:
     """Random light, colours per class, surfaces, lens and sensor."""
     count, _, height, width = camera.shape
-    draw = _Draw(generator, camera.device)
     colours, seen = camera[:, :3], camera[:, 3:]
     size = strength * draw.even(count, 1, 1, 1)
     mix = torch.eye(3, device=camera.device) + _MIX * size[..., 0] * draw.normal(count, 3, 3)
@@ -94,11 +91,10 @@ def _strange_image(
 
 
 def _strange_classes(
-    classes: Float[Tensor, "B C H W"], strength: float, generator: torch.Generator
+    classes: Float[Tensor, "B C H W"], strength: float, draw: _Draw
 ) -> Float[Tensor, "B C H W"]:
     """Random segmenter: outlines wander, objects grow, patches are confused or missing, confidence varies."""
     count, channels, height, width = classes.shape
-    draw = _Draw(generator, classes.device)
     # A quarter of the frames keeps the labels' own errors only.
     size = strength * draw.even(count, 1, 1, 1) * (draw.even(count, 1, 1, 1) > 0.25)
     moved = _displaced(classes, size * _SHIFTED_CELLS * draw.field(count, 2, height, width, 6))
@@ -117,10 +113,9 @@ def _strange_classes(
     return torch.cat([likelihood * known, known], 1)
 
 
-def _strange_lidar(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
+def _strange_lidar(sensors: SensorInputs, config: StrangeConfig, draw: _Draw) -> SensorInputs:
     """Another lidar: echoes on another scale, a ground a little off and flagged in part, points missing, rows apart."""
-    count, points = sensors.lidar_valid.shape
-    draw, strength = _Draw(generator, sensors.lidar_xyz_m.device), config.lidar
+    (count, points), strength = sensors.lidar_valid.shape, config.lidar
     features = sensors.lidar_features.clone()
     echo = features[..., _INTENSITY] ** torch.exp(strength * (2 * draw.even(count, 1) - 1))
     echo = echo + 0.1 * strength * draw.even(count, 1) * draw.normal(count, points)
@@ -134,18 +129,13 @@ def _strange_lidar(sensors: SensorInputs, config: StrangeConfig, generator: torc
     flagged = (draw.even(count, points) > strength * (2.2 * draw.even(count, 1) - 0.8)).float()
     features[..., _GROUND] = features[..., _GROUND] * flagged
     kept = draw.even(count, points) > 0.4 * strength * draw.even(count, 1)
-    thin = _chosen(count, config.fewer_rows, generator, kept.device)[:, None]
+    thin = draw.even(count, 1) < config.fewer_rows
     kept = kept & (~thin | _on_far_rows(sensors.lidar_xyz_m, draw))
     valid = sensors.lidar_valid & kept
-    enough = (valid.sum(1) >= _FEWEST_POINTS)[:, None]
+    valid = valid.where((valid.sum(1) >= _FEWEST_POINTS)[:, None], sensors.lidar_valid)
     # What stands near the road is not the same everywhere: frames look nearer or farther than they are.
     factor = torch.exp(strength * _NEARER * (2 * draw.even(count) - 1))
-    return replace(
-        sensors,
-        lidar_features=features,
-        lidar_valid=torch.where(enough, valid, sensors.lidar_valid),
-        nearness=factor,
-    )
+    return replace(sensors, lidar_features=features, lidar_valid=valid, nearness=factor)
 
 
 def _on_far_rows(xyz_m: Float[Tensor, "B N 3"], draw: _Draw) -> Bool[Tensor, "B N"]:
@@ -159,19 +149,12 @@ def _on_far_rows(xyz_m: Float[Tensor, "B N 3"], draw: _Draw) -> Bool[Tensor, "B 
 def _displaced(maps: Tensor, cells: Tensor) -> Tensor:
     """The maps looked up some cells away (columns, rows)."""
     count, _, height, width = maps.shape
-    row, column = torch.meshgrid(
-        torch.linspace(-1, 1, height, device=maps.device),
-        torch.linspace(-1, 1, width, device=maps.device),
-        indexing="ij",
-    )
+    sides = (torch.linspace(-1, 1, side, device=maps.device) for side in (height, width))
+    row, column = torch.meshgrid(*sides, indexing="ij")
     at = torch.stack([column, row], -1).expand(count, height, width, 2)
     step = maps.new_tensor([2 / (width - 1), 2 / (height - 1)])
     at = at + cells.permute(0, 2, 3, 1) * step
     return F.grid_sample(maps, at, mode="bilinear", padding_mode="border", align_corners=True)
-
-
-def _chosen(count: int, share: float, generator: torch.Generator, device: torch.device) -> Bool[Tensor, " B"]:
-    return (torch.rand(count, generator=generator) < share).to(device)
 
 
 class _Draw:
@@ -283,18 +266,13 @@ def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -
     v = (height - 1) / 2 - elevation / step
     at = torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1)
     image = _sampled(batch.image.float(), at, "bilinear")
-    classes = _sampled(batch.grid_class[:, None].float() + 1, at, "nearest")[
-        :, 0
-    ]  # 0 is left for "not there"
+    # 0 is left for "not there".
+    classes = _sampled(batch.grid_class[:, None].float() + 1, at, "nearest")[:, 0]
     seen = _sampled(batch.grid_seen[:, None].float(), at, "bilinear")[:, 0] > 0.999
     label = torch.where((classes > 0) & seen, classes - 1, torch.full_like(classes, UNKNOWN_CLASS))
-    return replace(
-        batch,
-        image=(image * seen[:, None]).round().to(torch.uint8),
-        grid_class=label.to(torch.uint8),
-        grid_seen=seen.to(torch.uint8),
-    )
+    image, label, seen = (maps.to(torch.uint8) for maps in ((image * seen[:, None]).round(), label, seen))
+    return replace(batch, image=image, grid_class=label, grid_seen=seen)
 
 
 def _sampled(maps: Tensor, at: Tensor, mode: str) -> Tensor:
-    return torch.nn.functional.grid_sample(maps, at, mode=mode, padding_mode="zeros", align_corners=True)
+    return F.grid_sample(maps, at, mode=mode, padding_mode="zeros", align_corners=True)

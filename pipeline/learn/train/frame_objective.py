@@ -8,10 +8,8 @@ Source: paper section 4.4 (SSL minimises L_P + L_G); edges, static points and th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
@@ -39,34 +37,36 @@ from pipeline.objective.differentiable.terms import (
     track_detection_cost,
 )
 
-__all__ = [
-    "FrameObjective", "at_lag", "frame_objective", "twist_between", "uncertainty_loss", "weighted",
-]  # fmt: skip
+__all__ = ["FrameObjective", "at_lag", "twist_between", "weighted"]
 
 _MARGIN_DEG = 3.0  # how wrong the reference may be, where points must lie in view
 _LOOP_METRE = 5.0  # 0.2 m counts as a degree, by which it moves what is 11 m away
 _PRIOR_ROUND_DEG = 0.05  # below this the absolute value is rounded off
-_LOG_VARIANCE = (-18.0, 2.0)  # sigmas of 0.1 mrad to 3 m: what lies beyond has no gradient
 
 
-@dataclass(frozen=True, eq=False)
 class FrameObjective:
-    """The objective of B frames, ready for any poses."""
+    """The objective of B frames, ready for any poses, on the batch's device."""
 
-    batch: TrainingBatch
-    maps: GridMaps
-    edge_in_view: Bool[Tensor, "B E"]
-    centres_rad: Float[Tensor, "B G 2"]
-    tracks: RadarTracks
-    radar_tells_elevation: Bool[Tensor, "B R"]
+    def __init__(self, batch: TrainingBatch) -> None:
+        self.batch, box = batch, batch.detection_box_rad
+        step_rad = batch.grid_step_deg / DEG
+        height, width = batch.grid_seen.shape[1:]
+        projection = GridProjection(-(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad)
+        self.maps = GridMaps(batch.edge_offset, batch.grid_seen.bool(), projection)
+        in_view = _surely_in_view(self.maps, batch.T_camera_lidar, batch.edge_xyz_m)
+        self.edge_in_view = batch.edge_valid & in_view
+        self.centres_rad = torch.stack([(box[..., 0] + box[..., 2]) / 2, (box[..., 1] + box[..., 3]) / 2], -1)
+        self.tracks = RadarTracks(batch.track_xyz_m, batch.track_valid, batch.radar_has_elevation)
+        limits = elevation_limits(batch.lidar_xyz_m, batch.lidar_valid)
+        T_lidar_radar = batch.T_lidar_radar.to(batch.radar_xyz_m.dtype)
+        self.radar_tells_elevation = tells_elevation(
+            T_lidar_radar, batch.radar_xyz_m, batch.radar_has_elevation, limits
+        )
 
     def terms(
-        self,
-        T_camera_lidar: Float[Tensor, "*batch B 4 4"],
-        T_camera_radar: Float[Tensor, "*batch B 4 4"],
-        T_lidar_radar: Float[Tensor, "*batch B 4 4"],
-        pairs: tuple[str, ...] = PAIRS_OF["joint"],
-    ) -> dict[str, Float[Tensor, "*batch B"]]:
+        self, T_camera_lidar: Float[Tensor, "*batch B 4 4"], T_camera_radar: Float[Tensor, "*batch B 4 4"],
+        T_lidar_radar: Float[Tensor, "*batch B 4 4"], pairs: tuple[str, ...] = PAIRS_OF["joint"],
+    ) -> dict[str, Float[Tensor, "*batch B"]]:  # fmt: skip
         """Every term of the pairs (`joint`: the loop) and frames, unweighted: LossConfig's names, prior by pair."""
         found, b = dict[str, Tensor](), self.batch
         if "camera_lidar" in pairs:
@@ -94,28 +94,6 @@ class FrameObjective:
             "lidar_radar": (T_lidar_radar, b.T_lidar_radar),
         }
         return found | {f"prior_{pair}": _from_prior(*poses[pair]) for pair in pairs if pair in poses}
-
-
-def frame_objective(batch: TrainingBatch) -> FrameObjective:
-    """Prepare the objective of a batch, on the batch's device."""
-    step_rad = batch.grid_step_deg / DEG
-    height, width = batch.grid_seen.shape[1:]
-    projection = GridProjection(-(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad)
-    maps = GridMaps(batch.edge_offset, batch.grid_seen.bool(), projection)
-    box = batch.detection_box_rad
-    return FrameObjective(
-        batch,
-        maps,
-        batch.edge_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.edge_xyz_m),
-        torch.stack([(box[..., 0] + box[..., 2]) / 2, (box[..., 1] + box[..., 3]) / 2], -1),
-        RadarTracks(batch.track_xyz_m, batch.track_valid, batch.radar_has_elevation),
-        tells_elevation(
-            batch.T_lidar_radar.to(batch.radar_xyz_m.dtype),
-            batch.radar_xyz_m,
-            batch.radar_has_elevation,
-            elevation_limits(batch.lidar_xyz_m, batch.lidar_valid),
-        ),
-    )
 
 
 def _from_prior(
@@ -163,22 +141,9 @@ def twist_between(
     """Rotation vector [rad] and translation [m] of T_a T_b^-1, for angles well below pi."""
     delta = T_a @ inverse(T_b)
     R = delta[..., :3, :3]
-    skew = (
-        torch.stack(
-            [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
-        )
-        / 2
-    )
+    skew = (R - R.transpose(-1, -2))[..., [2, 0, 1], [1, 2, 0]] / 2
     sine = skew.norm(dim=-1, keepdim=True)
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
     small = sine < 1e-6
     scale = torch.where(small, torch.ones_like(sine), torch.atan2(sine, cosine) / sine.clamp_min(1e-6))
     return torch.cat([scale * skew, delta[..., :3, 3]], -1)
-
-
-def uncertainty_loss(
-    log_variance: Float[Tensor, "B 3 6"], scatter: Float[Tensor, "B 3 6"]
-) -> Float[Tensor, ""]:
-    """Negative log-likelihood of the scatter; only the variances learn from it, because the scatter has no gradient."""
-    bounded = log_variance.clamp(*_LOG_VARIANCE)
-    return 0.5 * (scatter.square() * torch.exp(-bounded) + bounded).mean()

@@ -118,8 +118,6 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     """Read a checkpoint without running code in it; raises ContractError if it has another format."""
     try:
         state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise
     except Exception as err:  # torch raises whatever its unpickler met
         raise ContractError(str(path), f"no checkpoint that can be read: {err}") from err
     if state.get("format") != _FORMAT:
@@ -196,10 +194,9 @@ class DivergenceGuard:
 
     def check(self, step: int, loss: float, gradient_norm: float) -> None:
         """Check the loss of one step."""
-        if not math.isfinite(loss):
-            raise DivergedError(step, f"the loss is {loss}")
-        if not math.isfinite(gradient_norm):
-            raise DivergedError(step, f"the gradient's norm is {gradient_norm}")
+        for name, value in (("loss", loss), ("gradient's norm", gradient_norm)):
+            if not math.isfinite(value):
+                raise DivergedError(step, f"the {name} is {value}")
         self.seen += 1
         self.smooth = loss if self.smooth is None else self.smooth + _SMOOTHING * (loss - self.smooth)
         self.least = min(self.least, self.smooth)
@@ -256,12 +253,23 @@ class Run(ABC):
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint; every process must call this."""
         return {
-            "network": self.network.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "guard": asdict(self.guard),
-            "step": self.step,
-            "trained_s": self.trained_s,
-        }
+            "network": self.network.state_dict(), "optimiser": self.optimiser.state_dict(),
+            "guard": asdict(self.guard), "step": self.step, "trained_s": self.trained_s,
+            "config": self.descent.model_dump(mode="json"),
+        }  # fmt: skip
+
+    def resume(self, folder: Path) -> None:
+        """Continue at the folder's last checkpoint, if there is one; ConfigError if its run had other settings."""
+        if not (folder / LAST).exists():
+            return
+        state = load_checkpoint(folder / LAST, self.processes.device)
+        # By way of JSON, for checkpoints up to 0.13 hold tuples.
+        begun, now = json.loads(json.dumps(state["config"])), self.descent.model_dump(mode="json")
+        other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
+        if other:
+            problem = f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
+            raise ConfigError(str(folder), other[0], problem)
+        self.load(state)
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint."""

@@ -10,7 +10,6 @@ Source: paper, sections 4.3 (pairs), 4.4 (loop) and "Loss function" (L = L_P + L
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,6 +22,9 @@ from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.network.calibration_network import CalibrationNetwork, ConcatCore
 from pipeline.learn.sample.grid import LIDAR_FEATURES, RADAR_FEATURES
 from pipeline.objective.differentiable.paper import (
+    CameraRadarTensors,
+    FoldedTensors,
+    LidarRadarTensors,
     camera_radar_tensors,
     folded_tensors,
     lidar_radar_tensors,
@@ -45,13 +47,7 @@ _DERIVED = {"lidar": ("height", "edge", "ground"), "radar": ("moving",)}
 _RENDERED = 2  # channels before the features: occupied, nearness
 
 
-@runtime_checkable
-class PairLoss(Protocol):
-    """One pair's loss, ready for any pose."""
-
-    def frame_losses(self, T: Float[Tensor, "F 4 4"]) -> Float[Tensor, " F"]:
-        """Of each frame."""
-        ...
+PairLoss = FoldedTensors | CameraRadarTensors | LidarRadarTensors
 
 
 class PaperFrames:

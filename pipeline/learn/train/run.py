@@ -55,9 +55,8 @@ class RunState(Run):
     def __init__(self, lake: Lake, config: TrainConfig, processes: Processes, loader: TrainingLoader) -> None:
         self.config, self.loader = config, loader
         # Held-out frames as they are: in the mirror a mean answer has the opposite sign.
-        self.judging = config.model_copy(
-            update={"augment": config.augment.model_copy(update={"mirror_share": 0.0})}
-        )
+        unmirrored = config.augment.model_copy(update={"mirror_share": 0.0})
+        self.judging = config.model_copy(update={"augment": unmirrored})
         network = build_network(config.network, config.seed).to(processes.device)
         self.paper: PaperFrames | None = None
         if config.loss.definition == "paper":
@@ -117,8 +116,7 @@ class RunState(Run):
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint; every process must call this."""
         everyone = self.processes.gather({"stream": self.loader.state_dict()})
-        config = self.config.model_dump(mode="json")
-        return super().state() | {"config": config, "processes": everyone, "best": self.best}
+        return super().state() | {"processes": everyone, "best": self.best}
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
@@ -186,16 +184,6 @@ def _generator(seed: int, step: int, rank: int) -> torch.Generator:
     return torch.Generator().manual_seed((seed * 1_000_003 + step * 8_191 + rank * 131) % 2**63)
 
 
-def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:
-    now = config.model_dump(mode="json")
-    other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
-    if other:
-        problem = (
-            f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
-        )
-        raise ConfigError(str(folder), other[0], problem)
-
-
 @dataclass(frozen=True)
 class TrainRequest:
     """Options of a training command in addition to the configuration.
@@ -236,12 +224,9 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
         )  # fmt: skip
         stack.callback(loader.close)
         run = RunState(lake, config, processes, loader)
-        if (out / LAST).exists():
-            state = load_checkpoint(out / LAST, processes.device)
-            _same_config(out, state["config"], config)
-            run.load(state)
-        elif request.start is not None:
+        if request.start is not None and not (out / LAST).exists():
             _take_weights(run.network, request.start)
+        run.resume(out)
         log: MetricsLog | None = None
         if processes.leads:
             (out / "train.json").write_text(json.dumps(config.model_dump(mode="json"), indent=1) + "\n")

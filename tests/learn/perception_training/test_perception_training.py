@@ -238,7 +238,7 @@ def test_a_run_goes_on_with_its_own_configuration_and_samples_only(case, tmp_pat
     task, samples, quick = case
     few = quick.model_copy(update={"steps": 1})
     train_network(task, samples, tmp_path, few)
-    with pytest.raises(ConfigError, match="another folder"):
+    with pytest.raises(ConfigError, match="another steps"):
         train_network(task, samples, tmp_path, quick)
     with pytest.raises(ContractError, match="other samples"):
         swapped = replace(samples, train=samples.held_out, held_out=samples.train)

@@ -8,15 +8,9 @@ import torch
 
 from pipeline.learn.batches.batch import collate
 from pipeline.learn.sample.frame_sample import stored_grid
-from pipeline.learn.train.batch_loss import class_of_points
+from pipeline.learn.train.batch_loss import class_of_points, uncertainty_loss
 from pipeline.learn.train.domain_randomisation import mirrored, random_guess, turned_view
-from pipeline.learn.train.frame_objective import (
-    at_lag,
-    frame_objective,
-    twist_between,
-    uncertainty_loss,
-    weighted,
-)
+from pipeline.learn.train.frame_objective import FrameObjective, at_lag, twist_between, weighted
 from pipeline.learn.train.settings import AugmentConfig, LossConfig
 from pipeline.objective.camera_lidar.points import moving_poses
 from pipeline.objective.differentiable.projection import transform_points
@@ -75,7 +69,7 @@ def test_the_loss_of_many_frames_is_least_where_joint_found_the_day(tmp_path):
 
 
 def test_the_prior_pulls_with_the_same_small_force_however_far_away_and_rests_at_itself(few):
-    objective, pull = frame_objective(few), []
+    objective, pull = FrameObjective(few), []
     for shift_m in (0.0, 0.1, 0.3):
         xi = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, shift_m], requires_grad=True)
         T = exp_se3(xi) @ few.T_lidar_radar
@@ -86,7 +80,7 @@ def test_the_prior_pulls_with_the_same_small_force_however_far_away_and_rests_at
 
 
 def test_every_term_is_finite_with_a_finite_gradient_even_at_absurd_poses(few):
-    objective = frame_objective(few)
+    objective = FrameObjective(few)
     for size in (0.0, 0.1, 3.0):
         xi = (size * torch.randn(3, len(few), 6, generator=torch.Generator().manual_seed(0))).requires_grad_()
         given = few.T_camera_lidar, few.T_camera_radar, few.T_lidar_radar
@@ -126,7 +120,7 @@ def test_a_mirrored_frame_has_the_same_losses_and_classes_at_mirrored_poses(few)
     camera, other = torch.diag(torch.tensor([-1.0, 1, 1, 1])), torch.diag(torch.tensor([1.0, -1, 1, 1]))
     for T, left in zip(opposite, (camera, camera, other), strict=True):
         T[1::2] = left @ T[1::2] @ other
-    found, expected = frame_objective(there).terms(*opposite), frame_objective(few).terms(*poses)
+    found, expected = FrameObjective(there).terms(*opposite), FrameObjective(few).terms(*poses)
     for name, value in expected.items():
         np.testing.assert_allclose(found[name], value, rtol=2e-3, atol=2e-3, err_msg=name)
     assert same_class(few, poses[0], there, opposite[0]).min() > 0.999
