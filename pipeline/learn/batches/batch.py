@@ -22,10 +22,8 @@ __all__ = ["TrainingBatch", "collate"]
 
 _MAPS = {"image": (3,), "grid_class": (), "grid_seen": (), "edge_offset": (4,)}
 _ARRAYS = (
-    "detection_box_rad", "lidar_xyz_m",
-    "cluster_centre_m", "edge_xyz_m", "edge_side",
-    "radar_xyz_m", "radar_motion", "track_xyz_m",
-    "ego_velocity_mps",
+    "detection_box_rad", "lidar_xyz_m", "cluster_centre_m", "edge_xyz_m", "edge_side", "radar_xyz_m",
+    "radar_motion", "track_xyz_m", "ego_velocity_mps",
 )  # fmt: skip
 # Mask -> how many rows are real, and an array that has all of them.
 _MASKS = {

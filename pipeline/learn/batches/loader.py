@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,14 +21,6 @@ from pipeline.store.tables import RowGroup, read_columns, read_group, read_manif
 from schemas.training import TRAINING, TrainingRow
 
 __all__ = ["TrainingLoader", "load_split"]
-
-
-@dataclass(frozen=True)
-class _Chunk:
-    """A row group and those of its rows that belong to the split."""
-
-    group: RowGroup
-    rows: tuple[int, ...]
 
 
 class TrainingLoader:
@@ -65,7 +56,7 @@ class TrainingLoader:
     @property
     def frames(self) -> int:
         """Frames of the split, on all ranks."""
-        return sum(len(c.rows) for c in self._chunks)
+        return sum(len(rows) for _, rows in self._chunks)
 
     def __iter__(self) -> Iterator[TrainingBatch]:
         return self
@@ -83,12 +74,8 @@ class TrainingLoader:
 
     def state_dict(self) -> dict[str, Any]:
         """The place in the stream, after the last batch that was handed out."""
-        return {
-            "epoch": self._epoch,
-            "taken": self._taken,
-            "data": self._data_key,
-            "order": [self._seed, True, self._rank, self._ranks, self._window],
-        }
+        order = [self._seed, True, self._rank, self._ranks, self._window]
+        return {"epoch": self._epoch, "taken": self._taken, "data": self._data_key, "order": order}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue at a `state_dict`; raises ContractError if the table or the order differs."""
@@ -115,9 +102,9 @@ class TrainingLoader:
         self._order, self._windows = [], []
         for first in range(0, len(mine), self._window):
             window = mine[first : first + self._window]
-            frames = [(len(self._windows), chunk.group, row) for chunk in window for row in chunk.rows]
+            frames = [(len(self._windows), group, row) for group, rows in window for row in rows]
             self._order += [frames[i] for i in rng.permutation(len(frames))]
-            self._windows.append([chunk.group for chunk in window])
+            self._windows.append([group for group, _ in window])
         self._ordered_epoch, self._held_window = self._epoch, -1
 
     def _row(self, position: int) -> TrainingRow:
@@ -138,7 +125,7 @@ def load_split(
 ) -> TrainingBatch:
     """All frames of a split (at most `limit`, evenly spread) as one batch; `referenced` as of `TrainingLoader`."""
     chunks, _ = _find_chunks(lake, split, referenced)
-    frames = [(chunk.group, row) for chunk in chunks for row in chunk.rows]
+    frames = [(group, row) for group, own in chunks for row in own]
     if limit is not None and len(frames) > limit:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).astype(int)]
     rows: list[TrainingRow] = []
@@ -148,8 +135,10 @@ def load_split(
     return collate(rows)
 
 
-def _find_chunks(lake: Lake, split: str, referenced: bool) -> tuple[list[_Chunk], list[str]]:
-    """Row groups with frames of the split, in order, and their work keys."""
+def _find_chunks(
+    lake: Lake, split: str, referenced: bool
+) -> tuple[list[tuple[RowGroup, tuple[int, ...]]], list[str]]:
+    """Row groups with those of their rows that belong to the split, in order, and their work keys."""
     leaks = read_leaks(lake)
     chunks, keys = [], []
     for partition in lake.partitions(TRAINING.name):
@@ -164,7 +153,7 @@ def _find_chunks(lake: Lake, split: str, referenced: bool) -> tuple[list[_Chunk]
             rows = tuple(i for i in range(group.rows) if wanted[first + i])
             first += group.rows
             if rows:
-                chunks.append(_Chunk(group, rows))
+                chunks.append((group, rows))
         manifest = read_manifest(lake, TRAINING, partition)
         keys.append(manifest.work_key if manifest else "")
     if not chunks:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.sample.grid import CLASS_CONFIDENCE, Grid
-from pipeline.learn.sample.rendering import render_lidar, render_radar
+from pipeline.learn.sample.rendering import painted, render_lidar
 from pipeline.objective.differentiable.projection import transform_points
 from schemas.training import GRID_CLASSES, UNKNOWN_CLASS
 
@@ -123,7 +123,7 @@ def render(
         )
         views.append(found)
         indices.append(np.where(index >= 0, np.append(rows, -1)[index], -1))
-        scans.append(render_radar(radar[b, seen], radar_features[b, seen], grid))
+        scans.append(painted(radar[b, seen], radar_features[b, seen], grid)[0])
     view = RenderedView(
         torch.cat([sensors.camera, sensors.classes], 1) if classes else sensors.camera,
         radar_grid=torch.from_numpy(np.stack(scans)).to(device),

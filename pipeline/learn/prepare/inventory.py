@@ -119,16 +119,13 @@ def doubts(lake: Lake, *, referenced: bool) -> list[str]:
         if referenced and "prior" in light["reference"]:
             without.append(f"{day.vehicle} {day.day}")
         else:
-            drives |= {
-                (day, d) for d, side in zip(light["drive"], light["split"], strict=True) if side == "train"
-            }
+            rows = zip(light["drive"], light["split"], strict=True)
+            drives |= {(day, drive) for drive, side in rows if side == "train"}
     found = []
     if without:
         named = ", ".join(without[:5]) + (" ..." if len(without) > 5 else "")
-        found.append(
-            f"left out, because method joint has no usable record of them: {named}; "
-            "run `boresight calibrate`, then `boresight prepare`"
-        )
+        told = "run `boresight calibrate`, then `boresight prepare`"
+        found.append(f"left out, because method joint has no usable record of them: {named}; {told}")
     if len(drives) == 1:
         found.append(
             "all frames of side train are of one drive: add drives, or the network learns that street only"

@@ -19,26 +19,16 @@ from pipeline.store.tables import read_manifest
 from schemas.training import SPLITS, TRAINING
 
 __all__ = [
-    "Choice",
-    "decided_sides",
-    "frame_sides",
-    "price_choices",
-    "settled_keys",
-    "split_rule",
-    "split_settings",
-]
+    "Choice", "decided_sides", "frame_sides", "price_choices", "settled_keys", "split_rule", "split_settings",
+]  # fmt: skip
 
 Key = Literal["vehicle", "day", "place"]
 _FEW = 0.2  # of the frames
 _BETWEEN = (SampleReason.SPLIT_CONFLICT, SampleReason.NEXT_TO_OTHER_SPLIT)
 # What a question may need: nothing shared at all, or unseen vehicles, days, streets.
 _CHOICES: tuple[tuple[Key, ...], ...] = (
-    ("vehicle", "day", "place"),
-    ("vehicle", "place"),
-    ("vehicle",),
-    ("day",),
-    ("place",),
-)
+    ("vehicle", "day", "place"), ("vehicle", "place"), ("vehicle",), ("day",), ("place",),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -94,9 +84,8 @@ def frame_sides(
     sides = np.array([plan.side_of(vehicle, day, place) or "" for place in survey.place])
     reasons = np.full(len(sides), "", object)
     reasons[sides == ""] = SampleReason.SPLIT_CONFLICT.value
-    near = _near_other_side(survey, sides, config.split.guard_s) | _near_other_place(
-        survey, sides, plan, config
-    )
+    near = _near_other_side(survey, sides, config.split.guard_s)
+    near |= _near_other_place(survey, sides, plan, config)
     reasons[(reasons == "") & near] = SampleReason.NEXT_TO_OTHER_SPLIT.value
     reasons[~survey.moved] = SampleReason.HARDLY_MOVED.value
     reasons[~survey.perceived] = SampleReason.NOT_PERCEIVED.value

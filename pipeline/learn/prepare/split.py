@@ -19,7 +19,6 @@ from schemas.training import SPLITS
 
 __all__ = ["SplitPlan", "Unit", "environment_of_speeds", "plan_split"]
 
-TRAIN, VAL, TEST = SPLITS
 # As calibration_records: 72 km/h is above the limit in towns.
 _FAST_MPS, _MOVING_MPS = 20.0, 1.0
 
@@ -63,8 +62,8 @@ def plan_split(
         test_fraction: share of the frames that test a finished network.
         decided: sides of keys that earlier runs gave.
     """
-    shares = {TRAIN: 1 - val_fraction - test_fraction, VAL: val_fraction, TEST: test_fraction}
-    shares = {side: share for side, share in shares.items() if share > 0}
+    fractions = (1 - val_fraction - test_fraction, val_fraction, test_fraction)
+    shares = {side: share for side, share in zip(SPLITS, fractions, strict=True) if share > 0}
     units = sorted(units, key=lambda u: (u.vehicle, u.day, u.place))
     known = {key: side for key, side in (decided or {}).items() if key[0] in by and side in shares}
     return SplitPlan(tuple(by), _deal_groups(_linked(units, by), by, shares, seed, known) | known)
@@ -102,12 +101,9 @@ def _linked(units: Sequence[Unit], by: Sequence[str]) -> list[list[Unit]]:
 
 
 def _deal_groups(
-    groups: Sequence[list[Unit]],
-    by: Sequence[str],
-    shares: Mapping[str, float],
-    seed: int,
+    groups: Sequence[list[Unit]], by: Sequence[str], shares: Mapping[str, float], seed: int,
     known: Mapping[tuple[str, str], str],
-) -> dict[tuple[str, str], str]:
+) -> dict[tuple[str, str], str]:  # fmt: skip
     """Assign whole groups, the largest first, to the side that lacks most; every side gets at least one."""
     total = sum(u.frames for g in groups for u in g)
     have: Counter[str] = Counter()

@@ -36,20 +36,17 @@ def work(task: Task) -> Work:
     prior, chosen = rig.prior, rig.one_of_each("training")
     survey = survey_day(task.partition, task.lake, config)
     sides, rejected = frame_sides(survey, plan, config)
-    settings: dict[str, Any] = {
-        "prior_file": prior_key(task.fleet, vehicle),
-        "sides": [s or "" for s in sides],
-    }
     records = usable_records(task.lake, task.partition, chosen)
-    settings["joint"] = {pair: row.work_key for pair, row in records.items()}
+    settings: dict[str, Any] = {
+        "prior_file": prior_key(task.fleet, vehicle), "sides": [s or "" for s in sides],
+        "joint": {pair: row.work_key for pair, row in records.items()},
+    }  # fmt: skip
     settings |= {} if rig.three is None else {"three": rig.three}
     about = _about(survey, task.fleet.vehicle(vehicle).rig, sides)
     extra = {
-        "split_rule": split_rule(config),
-        "sides": _sides_given(survey, plan),
+        "split_rule": split_rule(config), "sides": _sides_given(survey, plan), SAMPLED: chosen,
         "grid": {"step_deg": config.grid.step_deg, "shape": list(config.grid.shape)},
-        SAMPLED: chosen,
-    }
+    }  # fmt: skip
 
     def rows(run: Run) -> Generator[TrainingRow, None, None]:
         run.rejected.update(rejected)
@@ -75,12 +72,9 @@ def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, A
 
 
 def _samples(
-    task: Task,
-    about: Mapping[int, About],
-    chosen: Chosen,
-    records: Mapping[str, CalibrationRecord],
+    task: Task, about: Mapping[int, About], chosen: Chosen, records: Mapping[str, CalibrationRecord],
     rejected: Counter[str],
-) -> Iterator[TrainingRow | None]:
+) -> Iterator[TrainingRow | None]:  # fmt: skip
     """The row of each wanted frame in order; None, counted in `rejected`, if it gives no sample."""
     if not about:
         return

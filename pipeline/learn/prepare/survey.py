@@ -63,12 +63,10 @@ def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Surve
     stamp = np.array(light["stamp_ns"], np.int64) * 1e-9
     drive = np.array(light["drive"], np.int64)
     x, y, speed = (np.array(light[n], np.float64) for n in ("ego_tx_m", "ego_ty_m", "ego_speed_mps"))
-    environments = {
-        int(d): environment_of_speeds(
-            [s for s, k in zip(light["ego_speed_mps"], drive, strict=True) if k == d]
-        )
-        for d in np.unique(drive)
-    }
+    speeds: dict[int, list[float | None]] = {int(d): [] for d in drive}
+    for d, of_frame in zip(drive, light["ego_speed_mps"], strict=True):
+        speeds[int(d)].append(of_frame)
+    environments = {d: environment_of_speeds(of_drive) for d, of_drive in speeds.items()}
     return Survey(
         partition, stamp, drive, np.array([i in perceived for i in light["moment"]], bool),
         _moved(stamp, drive, np.nan_to_num(speed, nan=np.inf), config.min_step_m),

@@ -64,14 +64,10 @@ def lidar_columns(
     rows = _thinned(np.flatnonzero(inside), angles, step_rad, count, rng)
     flags[rows] |= _ground_flags(xyz[rows], observation) * POINT_IS_GROUND
     rank = _ranks(frame.lidar_intensity, len(xyz))
-    return {
-        "lidar_xyz_m": padded_rows(xyz[rows], count),
-        "lidar_intensity": padded_rows(rank[rows], count),
-        "lidar_flags": padded_rows(flags[rows], count),
-        "lidar_count": len(rows),
-        **_cluster_columns(observation, view),
-        **_edge_columns(observation, view, config.edge_points, rng),
-    }
+    values = {"lidar_xyz_m": xyz, "lidar_intensity": rank, "lidar_flags": flags}
+    columns = {name: padded_rows(of_points[rows], count) for name, of_points in values.items()}
+    beside = _cluster_columns(observation, view) | _edge_columns(observation, view, config.edge_points, rng)
+    return columns | {"lidar_count": len(rows)} | beside
 
 
 def own_velocity(
@@ -169,9 +165,8 @@ def _ground_flags(xyz_m: np.ndarray, observation: Observation) -> np.ndarray:
     if not len(observation.lidar_map_xyz_m) or not len(xyz_m):
         return np.zeros(len(xyz_m), np.uint8)
     _, nearest = cKDTree(observation.lidar_map_xyz_m).query(xyz_m, distance_upper_bound=_SAME_POINT_M)
-    return np.append(observation.lidar_map_is_ground, 0).astype(np.uint8)[
-        nearest
-    ]  # one behind the last: none
+    is_ground = np.append(observation.lidar_map_is_ground, 0)  # one behind the last: none
+    return is_ground.astype(np.uint8)[nearest]
 
 
 def _ranks(intensity: np.ndarray | None, count: int) -> UInt8[np.ndarray, " N"]:

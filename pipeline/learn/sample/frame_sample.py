@@ -101,14 +101,11 @@ def make_row(
     camera = camera_of(observation)
     grid_class, edge_offset = camera_features(labels_of(observation), camera, grid)
     return replace(
-        sensors,
-        grid_class=grid_class.ravel(),
-        edge_offset=edge_offset.reshape(4, -1),
-        reference=reference.name,
+        sensors, grid_class=grid_class.ravel(), edge_offset=edge_offset.reshape(4, -1), reference=reference.name,
         camera_lag_s=sensors.camera_lag_s - reference.dt_camera_lidar_s,
         radar_lag_s=sensors.radar_lag_s + reference.dt_lidar_radar_s,
         **_detection_columns(observation, camera),
-    )
+    )  # fmt: skip
 
 
 def sensor_row(

@@ -35,7 +35,7 @@ from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = [
     "NEARNESS_M", "FrameSensors", "frame_sensors", "lidar_features", "mark_strength", "nearest_points",
-    "radar_features", "render_frame", "render_lidar", "render_radar",
+    "painted", "radar_features", "render_frame", "render_lidar",
 ]  # fmt: skip
 
 _INTENSITY = LIDAR_FEATURES.index("intensity")
@@ -92,15 +92,10 @@ def frame_sensors(
     part = grid.window(shape, row.grid_step_deg)
     image = row.image.reshape(3, *shape)[:, *part] / np.float32(255)
     seen = row.grid_seen.reshape(shape)[part].astype(np.float32)
-    return FrameSensors(
-        np.concatenate([image, seen[None]]).astype(np.float32),
-        row.lidar_xyz_m[: row.lidar_count].astype(np.float32),
-        lidar_features(row),
-        row.radar_xyz_m[: row.radar_count].astype(np.float32),
-        radar_features(row),
-        bool(row.radar_has_elevation),
-        classes,
-    )
+    camera = np.concatenate([image, seen[None]]).astype(np.float32)
+    lidar = row.lidar_xyz_m[: row.lidar_count].astype(np.float32), lidar_features(row)
+    radar = row.radar_xyz_m[: row.radar_count].astype(np.float32), radar_features(row)
+    return FrameSensors(camera, *lidar, *radar, bool(row.radar_has_elevation), classes)
 
 
 def lidar_features(row: TrainingRow) -> Float32[np.ndarray, "N 4"]:
@@ -108,12 +103,8 @@ def lidar_features(row: TrainingRow) -> Float32[np.ndarray, "N 4"]:
     count = row.lidar_count
     flags = row.lidar_flags[:count]
     height = _heights(row.lidar_xyz_m[:count].astype(np.float32), row.ground_plane)
-    features = [
-        row.lidar_intensity[:count] / np.float32(255),
-        height / np.float32(FEATURE_UNITS["height"]),
-        (flags & POINT_IS_EDGE) > 0,
-        (flags & POINT_IS_GROUND) > 0,
-    ]
+    measured = row.lidar_intensity[:count] / np.float32(255), height / np.float32(FEATURE_UNITS["height"])
+    features = [*measured, (flags & POINT_IS_EDGE) > 0, (flags & POINT_IS_GROUND) > 0]
     return np.stack(features, -1).astype(np.float32)
 
 
@@ -141,7 +132,7 @@ def render_frame(
     return {
         "camera": sensors.camera_channels(config.camera_channels),
         **{name: values[None] for name, values in lidar.items()},
-        "radar_grid": render_radar(radar_camera, sensors.radar_features, config.grid)[None],
+        "radar_grid": painted(radar_camera, sensors.radar_features, config.grid)[0][None],
         "radar_lidar": padded_rows(radar_lidar[:count], RADAR_POINTS)[None],
         "radar_camera": padded_rows(radar_camera[:count], RADAR_POINTS)[None],
         "radar_features": padded_rows(sensors.radar_features[:count], RADAR_POINTS)[None],
@@ -166,10 +157,10 @@ def render_lidar(
     matched = _best(rank + _EDGE_BONUS * edge + _OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
     solid = _best(rank, in_view & (ground < 0.5), OBJECT_POINTS)
     weight = np.where(ground > 0.5, np.float32(_GROUND_WEIGHT), np.float32(1))
-    painted, index = _painted(lidar_camera, features, grid, nearness)
-    strength, marked = _marks(painted, index) if marks else (np.zeros(0, np.float32), index[:0])
+    cells, index = painted(lidar_camera, features, grid, nearness)
+    strength, marked = _marks(cells, index) if marks else (np.zeros(0, np.float32), index[:0])
     return {
-        "lidar_grid": painted,
+        "lidar_grid": cells,
         "points_camera": padded_rows(lidar_camera[matched], MATCHED_POINTS),
         "point_weight": padded_rows(weight[matched], MATCHED_POINTS),
         "objects": padded_rows(xyz_m[solid], OBJECT_POINTS),
@@ -177,13 +168,6 @@ def render_lidar(
         "marks_camera": padded_rows(lidar_camera[marked], MARKED_POINTS),
         "mark_weight": padded_rows(strength, MARKED_POINTS),
     }, index
-
-
-def render_radar(
-    points_camera: Float32[np.ndarray, "M 3"], features: Float32[np.ndarray, "M 3"], grid: Grid
-) -> Float32[np.ndarray, "5 H W"]:
-    """A scan's cells; points in the optical frame."""
-    return _painted(points_camera, features, grid)[0]
 
 
 def nearest_points(points_camera: Float[np.ndarray, "N 3"], grid: Grid) -> Int32[np.ndarray, " HW"]:
@@ -216,10 +200,11 @@ def _nearest(points, limits, height, width, out):  # noqa: ANN001, ANN202 - comp
             out[cell] = n
 
 
-def _painted(
-    points_camera: np.ndarray, features: np.ndarray, grid: Grid, nearness: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """C H W: occupied, nearness and features of the points that won their cells; and which points these are."""
+def painted(
+    points_camera: Float32[np.ndarray, "N 3"], features: Float32[np.ndarray, "N F"], grid: Grid,
+    nearness: float = 1.0,
+) -> tuple[Float32[np.ndarray, "C H W"], Int32[np.ndarray, " HW"]]:  # fmt: skip
+    """Of a sweep or scan: occupied, nearness and features of the points that won their cells; and these points."""
     index = nearest_points(points_camera, grid)
     out = np.zeros((2 + features.shape[1], len(index)), np.float32)
     full = np.flatnonzero(index >= 0)
@@ -231,24 +216,21 @@ def _painted(
     return out.reshape(-1, grid.height, grid.width), index
 
 
-def mark_strength(painted: Float32[np.ndarray, "6 H W"]) -> Float32[np.ndarray, "H W"]:
+def mark_strength(sweep: Float32[np.ndarray, "6 H W"]) -> Float32[np.ndarray, "H W"]:
     """Contrast of each cell's ground with its neighbours in the row: 0 up to one sigma, 1 from _MARK_SIGMAS on.
 
     Zero everywhere if no reflectivity is logged.
     """
-    ground = painted[0] * painted[2 + _GROUND]
-    values = painted[2 + _INTENSITY] * ground
-    share = _row_sums(ground)
-    above = (
-        painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, MARK_LEAST_SHARE * _MARK_WINDOW)
-    ) * ground
+    ground, intensity = sweep[0] * sweep[2 + _GROUND], sweep[2 + _INTENSITY]
+    share = np.maximum(_row_sums(ground), MARK_LEAST_SHARE * _MARK_WINDOW)
+    above = (intensity - _row_sums(intensity * ground) / share) * ground
     spread = np.sqrt((above * above).sum() / max(ground.sum(), 1.0)) + MARK_FLAT
     return np.clip((above / spread - 1) / (_MARK_SIGMAS - 1), 0, 1).astype(np.float32)
 
 
-def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _marks(sweep: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Strength and points of the brightest ground, brightest first."""
-    strength = mark_strength(painted).ravel()
+    strength = mark_strength(sweep).ravel()
     cells = np.flatnonzero(strength)
     cells = cells[np.argsort(-strength[cells], kind="stable")][:MARKED_POINTS]
     return strength[cells], index[cells]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.learn.sample.grid import Grid, grid_rays, resample_camera
-from pipeline.learn.sample.rendering import NEARNESS_M, nearest_points, render_radar
+from pipeline.learn.sample.rendering import NEARNESS_M, nearest_points, painted
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import camera_direction_angles
 
@@ -32,10 +32,10 @@ def test_a_point_on_the_ray_of_each_cell_is_rendered_into_that_cell():
     rays = grid_rays(GRID).reshape(-1, 3)
     points = (rays * np.linspace(6, 90, len(rays))[:, None]).astype(np.float32)
     np.testing.assert_array_equal(cells(points), np.arange(len(rays)))
-    painted = render_radar(points, np.tile(np.arange(3, dtype=np.float32), (len(points), 1)), GRID)
+    image, _ = painted(points, np.tile(np.arange(3, dtype=np.float32), (len(points), 1)), GRID)
     near = np.minimum(NEARNESS_M / np.linalg.norm(points, axis=1), 2)
-    assert painted[1].ravel() == pytest.approx(near, rel=1e-5)
-    np.testing.assert_array_equal(painted[[0, 2, 3, 4]].mean(axis=(1, 2)), [1, 0, 1, 2])
+    assert image[1].ravel() == pytest.approx(near, rel=1e-5)
+    np.testing.assert_array_equal(image[[0, 2, 3, 4]].mean(axis=(1, 2)), [1, 0, 1, 2])
 
 
 def test_what_is_behind_or_outside_is_not_rendered():
