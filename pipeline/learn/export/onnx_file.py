@@ -83,15 +83,11 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     _shorten_names(model, {*GRAPH_INPUTS, *names})
     config = network.config
     metadata = {
-        "network": json.dumps(asdict(config)),
-        "architecture": config.architecture,
-        "pairs": json.dumps(PAIRS),
-        "classes": json.dumps(GRID_CLASSES),
-        "grid": json.dumps(asdict(config.grid)),
-        "code_version": CODE_VERSION,
-        "card": json.dumps(card or {}, default=str),
+        "network": json.dumps(asdict(config)), "architecture": config.architecture, "pairs": json.dumps(PAIRS),
+        "classes": json.dumps(GRID_CLASSES), "grid": json.dumps(asdict(config.grid)),
+        "code_version": CODE_VERSION, "card": json.dumps(card or {}, default=str),
         WEIGHTS: json.dumps(weight_places(network.state_dict(), model)),
-    }
+    }  # fmt: skip
     for key, value in metadata.items():
         entry = model.metadata_props.add()
         entry.key, entry.value = key, value
@@ -101,12 +97,9 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     about = {
         "purpose": f"calibration from single frames ({config.pairs}): methods joint-ssl and pairwise-ssl",
         "command": "boresight train, boresight export onnx",
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "architecture": config.architecture,
-        "network": asdict(config),
-        "classes": list(GRID_CLASSES),
-        "code_version": CODE_VERSION,
-    }
+        "parameters": sum(p.numel() for p in network.parameters()), "architecture": config.architecture,
+        "network": asdict(config), "classes": list(GRID_CLASSES), "code_version": CODE_VERSION,
+    }  # fmt: skip
     write_card(out, about | (card or {}))
     return out
 
@@ -176,13 +169,8 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
     best = (folder / BEST).exists()
     chosen, last = load_checkpoint(folder / (BEST if best else LAST)), load_checkpoint(folder / LAST)
     config = chosen["config"]
-    validation = {
-        k.removeprefix("validation/"): v
-        for report in read_metrics(folder)
-        if report["step"] <= chosen["step"]
-        for k, v in report.items()
-        if k.startswith("validation/")
-    }
+    reports = [r for r in read_metrics(folder) if r["step"] <= chosen["step"]]
+    told = {name: value for report in reports for name, value in report.items()}
     unfit = []  # for weights that no held-out frames chose, or that are those of the start
     if not best:
         unfit = [f"{UNFIT}: not validated on held-out frames. `calibrate` holds all its results."]
@@ -193,7 +181,7 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
         "data": {"cell_deg": config["cell_deg"], "frames_per_step": config["batch_size"]},
         "seeds": [config["seed"]],
         "time": {"steps": last["step"], "minutes": round(last["trained_s"] / 60, 1)},
-        "results": validation,
+        "results": {n.removeprefix("validation/"): v for n, v in told.items() if n.startswith("validation/")},
         "limits": _LIMITS,
         "training": config,
     }

@@ -41,11 +41,9 @@ _OPEN = {
 
 
 def write_card(
-    output: Output,
-    settings: Mapping[str, Any],
-    days: Sequence[Partition],
+    output: Output, settings: Mapping[str, Any], days: Sequence[Partition],
     left_out: Sequence[Mapping[str, str]],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Write card.json and README.md of an export from its finished days; returns the card."""
     done = [told for day in days if (told := output.done(day)) is not None]
     frames, lost, sensors = Counter[str](), Counter[str](), Counter[str]()
@@ -58,19 +56,12 @@ def write_card(
         if part in files:
             files[part].append(row)
     card = {
-        "made_by": f"Boresight {CODE_VERSION}",
-        "settings": dict(settings),
-        "frames": {split: frames[split] for split in SPLITS},
-        "frames_of_sensors": dict(sensors),
-        "frames_left_out": dict(lost),
-        "vehicle_days": [
-            {n: t[n] for n in ("vehicle", "day", "frames", "left_out", "calibration")} for t in done
-        ],
-        "vehicle_days_left_out": list(left_out),
-        "conventions": _CONVENTIONS,
+        "made_by": f"Boresight {CODE_VERSION}", "settings": dict(settings), "files": files,
+        "frames": {split: frames[split] for split in SPLITS}, "frames_of_sensors": dict(sensors),
+        "frames_left_out": dict(lost), "vehicle_days_left_out": list(left_out), "conventions": _CONVENTIONS,
+        "vehicle_days": [{n: t[n] for n in ("vehicle", "day", "frames", "left_out", "calibration")} for t in done],
         "labels": "Cityscapes train ids (0 road .. 18 bicycle, 255 void), as perceive read or made them",
-        "files": files,
-    }
+    }  # fmt: skip
     if settings["format"] == "nuscenes":
         finish_nuscenes(output, days)
     if settings["format"] == "parquet":

@@ -153,11 +153,8 @@ def _as_begun(config: PrepareConfig, settings: Mapping[str, Any], begun: Mapping
         config = config.split_with(by=tuple(begun["split"]["split_by"]))
     now = _with_split(settings, config)
     changed = [n for n in settings if begun.get(n) != now[n]]
-    changed += [
-        _KEYS.get(n, f"[prepare.split] {n}")
-        for n, value in now["split"].items()
-        if begun["split"][n] != value
-    ]
+    other = [n for n, value in now["split"].items() if begun["split"][n] != value]
+    changed += [_KEYS.get(n, f"[prepare.split] {n}") for n in other]
     if changed:
         raise ConfigError("command line", "out", f"holds an export with another {', '.join(changed)}")
     return config
@@ -180,9 +177,6 @@ def _require_splits(config: PrepareConfig, planned: _Planned) -> None:
             f'{", ".join(config.split.by)}; set by = "place", or export with --unsplit: all into train'
         )
         raise ConfigError("fleet.toml", "prepare.split.by", problem)
-
-
-_TOO_FEW = "fewer_than_two_sensors"
 
 
 _FORMATS: dict[str, type[ShardWriter | NuScenesWriter]] = {"parquet": ShardWriter, "nuscenes": NuScenesWriter}
@@ -217,11 +211,9 @@ def export_day(task: DayTask, progress: Progress) -> str:
         n: {"T_reference_sensor": T.tolist()} | dict(mounting.about.get(n, {})) for n, T in mounting.T.items()
     }
     calibration = {
-        "source": mounting.source,
-        "reference": mounting.reference,
-        "sensors": poses,
+        "source": mounting.source, "reference": mounting.reference, "sensors": poses,
         "left_out": dict(mounting.left_out),
-    }
+    }  # fmt: skip
     about = {"work_key": key, "vehicle": task.partition.vehicle, "day": task.partition.day}
     output.finish(task.partition, about | told | {"calibration": calibration})
     return "done"
@@ -236,7 +228,7 @@ def _write(task: DayTask, output: DayOutput, progress: Progress) -> dict[str, di
         for done, frame in enumerate(frames):
             progress(done, len(task.places), "frames")
             if frame is None:
-                lost[_TOO_FEW] += 1
+                lost["fewer_than_two_sensors"] += 1
                 continue
             writer.add(frame)
             kept[frame.at.split] += 1

@@ -128,18 +128,13 @@ def points_of(capture: Sweep | Scan) -> Float32[np.ndarray, "N C"]:
 
 
 def read_frames(
-    lake: Lake,
-    partition: Partition,
-    places: Sequence[Place],
-    mounting: Mounting,
+    lake: Lake, partition: Partition, places: Sequence[Place], mounting: Mounting,
     perturbation: Perturbation | None,
-) -> Iterator[Frame | None]:
+) -> Iterator[Frame | None]:  # fmt: skip
     """Wanted frames of a vehicle-day in order; None for a frame with fewer than two posed sensors."""
     moments, sensors = [p.moment for p in places], list(mounting.T)
-    seen = joined(lake, PERCEIVED, partition, sensors, moments)
-    for at, (moment, captures), (_, found) in zip(
-        places, joined(lake, MOMENTS, partition, sensors, moments), seen, strict=True
-    ):
+    logged, seen = (joined(lake, table, partition, sensors, moments) for table in (MOMENTS, PERCEIVED))
+    for at, (moment, captures), (_, found) in zip(places, logged, seen, strict=True):
         if len(captures) < 2:
             yield None
             continue
@@ -154,27 +149,18 @@ def read_frames(
 
 def facts_of(frame: Frame) -> dict[str, Any]:
     """Plain values of a frame; 4x4 matrices are row-major, T_a_b takes coordinates in b to a."""
-    moment, T_odom = frame.moment, frame.T_odom_vehicle
-    T_base = frame.mounting.T_base_reference
+    moment, at, mounting = frame.moment, frame.at, frame.mounting
+    T_base, T_odom = mounting.T_base_reference, frame.T_odom_vehicle
     return {
-        "key": frame.key,
-        "vehicle": frame.partition.vehicle,
-        "day": frame.partition.day,
-        "log": moment.log,
-        "drive": moment.drive,
-        "moment": moment.moment,
-        "stamp_ns": moment.stamp_ns,
-        "split": frame.at.split,
-        "place": frame.at.place,
-        "environment": frame.at.environment,
-        "calibration": frame.mounting.source,
-        "reference": frame.mounting.reference,
+        "key": frame.key, "vehicle": frame.partition.vehicle, "day": frame.partition.day,
+        "log": moment.log, "drive": moment.drive, "moment": moment.moment, "stamp_ns": moment.stamp_ns,
+        "split": at.split, "place": at.place, "environment": at.environment,
+        "calibration": mounting.source, "reference": mounting.reference,
         "T_base_reference": None if T_base is None else T_base.tolist(),
         "T_odom_vehicle": None if T_odom is None else T_odom.tolist(),
-        "ego_speed_mps": moment.ego_speed_mps,
-        "ego_yaw_rate_radps": moment.ego_yaw_rate_radps,
+        "ego_speed_mps": moment.ego_speed_mps, "ego_yaw_rate_radps": moment.ego_yaw_rate_radps,
         "sensors": {name: _sensor(frame, name) for name in frame.captures},
-    }
+    }  # fmt: skip
 
 
 def to_json(value: Any) -> bytes:
@@ -198,18 +184,13 @@ def _sensor(frame: Frame, name: str) -> dict[str, Any]:
         told["doppler_period_mps"] = capture.doppler_period_mps
     else:
         told |= {
-            "kind": "camera",
-            "camera_model": capture.camera_model,
-            "camera_K": capture.camera_K.tolist(),
-            "camera_D": capture.camera_D.tolist(),
-            "width_px": capture.image_width_px,
-            "height_px": capture.image_height_px,
-        }
+            "kind": "camera", "camera_model": capture.camera_model,
+            "camera_K": capture.camera_K.tolist(), "camera_D": capture.camera_D.tolist(),
+            "width_px": capture.image_width_px, "height_px": capture.image_height_px,
+        }  # fmt: skip
         if (found := frame.seen.get(name)) is not None:
             told |= {
-                "label_scale": found.label_scale,
-                "boxes_px": found.road_user_boxes_px.tolist(),
-                "box_classes": found.road_user_classes,
-                "box_scores": found.road_user_scores.tolist(),
-            }
+                "label_scale": found.label_scale, "boxes_px": found.road_user_boxes_px.tolist(),
+                "box_classes": found.road_user_classes, "box_scores": found.road_user_scores.tolist(),
+            }  # fmt: skip
     return told

@@ -34,14 +34,8 @@ from schemas.features import ImageFeatureColumns
 from schemas.training import SPLITS
 
 __all__ = [
-    "VERSION",
-    "Boxes",
-    "NuScenesWriter",
-    "Undistortion",
-    "finish_nuscenes",
-    "token_of",
-    "undistortion_of",
-]
+    "VERSION", "Boxes", "NuScenesWriter", "Undistortion", "finish_nuscenes", "token_of", "undistortion_of",
+]  # fmt: skip
 
 # Channels of sensors that are called by their kinds, as loaders expect them.
 _CHANNELS = {"camera": "CAM_FRONT", "lidar": "LIDAR_TOP", "radar": "RADAR_FRONT"}
@@ -82,11 +76,9 @@ class NuScenesWriter:
         if not self._count:
             self._first = frame
         sample = {
-            "token": token_of("sample", frame.key),
-            "timestamp": _us(frame.moment.stamp_ns),
-            "scene_token": token_of("scene", self._first.key),
-            "prev": self._last.get("token", ""),
-        }
+            "token": token_of("sample", frame.key), "timestamp": _us(frame.moment.stamp_ns),
+            "scene_token": token_of("scene", self._first.key), "prev": self._last.get("token", ""),
+        }  # fmt: skip
         self._follow("sample", self._last, sample["token"])
         self._last, self._count = sample, self._count + 1
         for name in frame.captures:
@@ -137,9 +129,8 @@ class NuScenesWriter:
         }  # fmt: skip
         self._follow("sample_data", before, token)
         self._latest[channel] = row
-        self._output.list(
-            "ego_pose", {"token": token, "timestamp": _us(capture.stamp_ns)} | _pose(T_odom_ego)
-        )
+        at = {"token": token, "timestamp": _us(capture.stamp_ns)}
+        self._output.list("ego_pose", at | _pose(T_odom_ego))
         if isinstance(capture, Image):
             self._seen(frame, name, channel, token, capture)
 
@@ -273,9 +264,7 @@ def finish_nuscenes(output: Output, days: Sequence[Partition]) -> None:
     logs: list[str] = []
     known: set[str] = set()  # of tables whose rows several days share
     with ExitStack() as stack:
-        streams = {
-            table: stack.enter_context(output.replacing(f"{VERSION}/{table}.json")) for table in _TABLES
-        }
+        streams = {t: stack.enter_context(output.replacing(f"{VERSION}/{t}.json")) for t in _TABLES}
         began = set[str]()
         for day in days:
             for table, row in output.rows(day):
@@ -334,9 +323,8 @@ class Undistortion:
         size = (self.camera.width_px, self.camera.height_px)
         full = cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)
         if self.maps is not None:
-            full = cv2.remap(
-                full, *self.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=_VOID
-            )
+            beyond = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": _VOID}
+            full = cv2.remap(full, *self.maps, cv2.INTER_NEAREST, **beyond)
         return cv2.imencode(".png", full)[1].tobytes()
 
     def boxes(self, found: ImageFeatureColumns) -> Boxes:
@@ -355,9 +343,8 @@ class Undistortion:
             corners = (rays / rays[:, 2:]) @ self.camera.K.T
         if not len(corners):
             return None
-        low, high = (
-            np.clip(end, 0, size) for end in (corners[:, :2].min(axis=0), corners[:, :2].max(axis=0))
-        )
+        ends = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+        low, high = (np.clip(end, 0, size) for end in ends)
         return [*map(float, low), *map(float, high)] if np.all(high > low) else None
 
 

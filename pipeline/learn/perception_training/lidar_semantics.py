@@ -113,13 +113,10 @@ def hidden_points(
     """Points hidden from the camera by standing objects (optical frame)."""
     range_m = np.linalg.norm(points_camera, axis=1)
     ahead = points_camera[:, 2] > 0
-    angles = np.stack(
-        [np.arctan2(points_camera[:, 0], points_camera[:, 2]), -points_camera[:, 1] / range_m], 1
-    )
+    azimuth = np.arctan2(points_camera[:, 0], points_camera[:, 2])
+    angles = np.stack([azimuth, -points_camera[:, 1] / range_m], 1)
     row = np.floor((angles + np.pi) / _COVERS_RAD).astype(np.int64)
-    nearest = np.full(
-        (int(2 * np.pi / _COVERS_RAD[0]) + 3, int(2 * np.pi / _COVERS_RAD[1]) + 3), np.inf, np.float32
-    )
+    nearest = np.full((2 * np.pi / _COVERS_RAD).astype(int) + 3, np.inf, np.float32)
     who = standing & ahead
     np.minimum.at(nearest, (row[who, 0], row[who, 1]), range_m[who])
     around = cv2.erode(nearest, np.ones((3, 3), np.uint8))
@@ -213,23 +210,17 @@ def _layout_of(frames: Iterable[Frame], rows: int, columns: int) -> SweepLayout:
 
 
 def day_images(
-    frames: Iterable[Frame],
-    observations: Sequence[Observation],
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    layout: SweepLayout,
-    limit: int,
-) -> SweepImages:
+    frames: Iterable[Frame], observations: Sequence[Observation], T_camera_lidar: Float[np.ndarray, "4 4"],
+    layout: SweepLayout, limit: int,
+) -> SweepImages:  # fmt: skip
     """Whole images of at most `limit` frames of a vehicle-day, evenly spread.
 
     Frames that perception rejected are left out. `T_camera_lidar` is the current calibration, never a truth.
     """
     chosen = np.linspace(0, len(observations) - 1, min(limit, len(observations))).astype(int)
     wanted = {observations[i].frame_index: observations[i] for i in chosen}
-    made = [
-        _image(frame, wanted[frame.frame_index], T_camera_lidar, layout)
-        for frame in frames
-        if frame.frame_index in wanted
-    ]
+    pairs = ((frame, wanted.get(frame.frame_index)) for frame in frames)
+    made = [_image(frame, own, T_camera_lidar, layout) for frame, own in pairs if own is not None]
     kinds = np.dtype([("channels", "f2", (_CHANNELS, *layout.size)), ("label", "u1", layout.size)])
     return SweepImages(**columns_of(made, kinds), layout=layout)
 
@@ -241,12 +232,10 @@ def cut(samples: Samples[SweepImages]) -> Samples[SweepImages]:
     columns = np.flatnonzero(shown) if shown.any() else np.arange(len(shown))
     first, last = max(0, int(columns[0]) - _EDGE_PX), min(len(shown), int(columns[-1]) + 1 + _EDGE_PX)
     last -= (last - first) % 2  # the network halves the columns
+    part = slice(first, last)
     train, held_out = (
-        replace(
-            side, channels=side.channels[..., first:last].copy(), label=side.label[..., first:last].copy()
-        )
-        for side in sides
-    )
+        replace(side, channels=side.channels[..., part].copy(), label=side.label[..., part].copy()) for side in sides
+    )  # fmt: skip
     return replace(samples, train=train, held_out=held_out)
 
 
@@ -308,10 +297,8 @@ class LidarSemantics(Task[SweepImages]):
         """Weighted cross-entropy of the varied batch over its labelled pixels."""
         channels, label = _varied(batch, rng)
         target = torch.from_numpy(label.astype(np.int64))
-        logits = network(self._normalised(channels))
-        total = functional.cross_entropy(
-            logits, target, self.weight, ignore_index=UNLABELLED, reduction="sum"
-        )
+        given = network(self._normalised(channels)), target, self.weight
+        total = functional.cross_entropy(*given, ignore_index=UNLABELLED, reduction="sum")
         return total / self.weight[target].sum().clamp(min=1e-6)
 
     def scores(self, network: nn.Module, held_out: SweepImages) -> dict[str, float]:

@@ -141,10 +141,8 @@ def _rows(
     for i, observation in enumerate(observations):
         features = memory.features(_scan_of(observation))
         if i in kept:
-            geometric = sector_mask(
-                observation.radar_drivable_azimuth_rad, observation.radar_drivable_range_m
-            )
-            yield features.astype(np.float16), label_grid(observation, T_lidar_radar), geometric
+            sector = observation.radar_drivable_azimuth_rad, observation.radar_drivable_range_m
+            yield features.astype(np.float16), label_grid(observation, T_lidar_radar), sector_mask(*sector)
 
 
 def _occupied(xyz_m: np.ndarray) -> np.ndarray:
@@ -229,9 +227,6 @@ def area_iou(answer: np.ndarray, label: np.ndarray) -> float:
 
 def probabilities(network: nn.Module, samples: DrivableSamples) -> Float[np.ndarray, "N A R"]:
     """How likely each cell is drivable."""
+    batches = (samples.features[i : i + 16] for i in range(0, len(samples), 16))
     with torch.no_grad():
-        parts = [
-            torch.sigmoid(network(torch.from_numpy(samples.features[i : i + 16]).float()))
-            for i in range(0, len(samples), 16)
-        ]
-    return torch.cat(parts).numpy()
+        return torch.cat([torch.sigmoid(network(torch.from_numpy(b).float())) for b in batches]).numpy()

@@ -171,14 +171,10 @@ def export_model(
     onnx.checker.check_model(trace_to_onnx(module, (example,), unfinished, names[:1], names[1:]))
     unfinished.replace(model)
     about = {
-        "code_version": CODE_VERSION,
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "purpose": task.purpose,
-        "command": f"boresight train --task {task.name}",
-        **card,
-        "limits": task.limits,
-    }
-    write_card(model, about)
+        "code_version": CODE_VERSION, "parameters": sum(p.numel() for p in network.parameters()),
+        "purpose": task.purpose, "command": f"boresight train --task {task.name}",
+    }  # fmt: skip
+    write_card(model, about | card | {"limits": task.limits})
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     path = folder / f"{task.name}.toml"
     path.write_text(f'path = "{model.name}"\nsha256 = "{digest}"\n{manifest}')
