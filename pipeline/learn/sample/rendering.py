@@ -54,7 +54,7 @@ _MARGIN_DEG = 8.0  # beyond the grid's border: for guesses that are wrong
 
 @dataclass(frozen=True, eq=False)
 class FrameSensors:
-    """One frame of `network.inputs.SensorInputs`, without the padding."""
+    """One frame of `network.views.SensorInputs`, without the padding."""
 
     camera: Float32[np.ndarray, "4 H W"]
     lidar_xyz_m: Float32[np.ndarray, "N 3"]
@@ -85,8 +85,7 @@ def frame_sensors(
 ) -> FrameSensors:
     """Inputs from a row of table `training`; raises ValueError if its grid does not contain the network's.
 
-    `classes` is the likelihood of a segmenter's classes on the grid (`camera_maps.class_likelihood`), or
-    None.
+    `classes` is the likelihood of a segmenter's classes on the grid (`frame_sample.class_likelihood`), or None.
     """
     shape = (row.grid_height, row.grid_width)
     part = grid.window(shape, row.grid_step_deg)
