@@ -84,15 +84,8 @@ def s3(s3_server: S3, monkeypatch: pytest.MonkeyPatch) -> Generator[S3]:
 # Where the heavy files are, so that no worker begins one when the other has nothing left. Others keep their order.
 # While the first compiles the loops of the checkout, the second compiles those of the wheel, not the same ones.
 HEAVIEST_FIRST = (
-    "accuracy",
-    "test_wheel.py",
-    "end_to_end",
-    "learn",
-    "calibrate",
-    "jobs",
-    "simulate",
-    "verify",
-)
+    "accuracy", "test_wheel.py", "end_to_end", "learn", "calibrate", "jobs", "simulate", "verify",
+)  # fmt: skip
 
 
 @pytest.hookimpl(trylast=True)

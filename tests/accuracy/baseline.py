@@ -28,15 +28,8 @@ from tests.benchmarks.studies.metrics import within
 from tests.budgets import slowness
 
 __all__ = [
-    "BASELINE",
-    "baseline_of",
-    "keep_noise",
-    "main",
-    "together",
-    "worse",
-    "wrong_and_accepted",
-    "z_scores",
-]
+    "BASELINE", "baseline_of", "keep_noise", "main", "together", "worse", "wrong_and_accepted", "z_scores",
+]  # fmt: skip
 BASELINE = Path(__file__).parent / "baseline.json"
 _DRAWS = range(4)  # calibrations of a day behind a baseline
 _NOISE_SD = 3.0

@@ -60,21 +60,14 @@ FIXED = (
     # A world that a seed drew (a parking deck) and that no tuning saw; its elevation errs by two of its sigmas.
     FixedDay("drawn world", DaySpec(6390, "world-6390", 40, "demo"), held=("camera_lidar",)),
     FixedDay(
-        "real car",
-        DaySpec(0, "real", 0, "real"),
-        logs="astyx/astyx-1_*",
-        fleet=_HERE.parent / "end_to_end" / "astyx.toml",
-        partition=Partition("astyx-1", "2019-01-14"),
+        "real car", DaySpec(0, "real", 0, "real"), logs="astyx/astyx-1_*",
+        fleet=_HERE.parent / "end_to_end" / "astyx.toml", partition=Partition("astyx-1", "2019-01-14"),
     ),
     FixedDay(
-        "other world",
-        DaySpec(0, "other", 0, "other_world"),
-        prior=("logged", 5.0, 0.1),
-        logs="other_world/*.mcap",
-        fleet=_HERE / "other_world.toml",
-        partition=Partition("veh00", "2026-03-02"),
+        "other world", DaySpec(0, "other", 0, "other_world"), prior=("logged", 5.0, 0.1),
+        logs="other_world/*.mcap", fleet=_HERE / "other_world.toml", partition=Partition("veh00", "2026-03-02"),
     ),
-)
+)  # fmt: skip
 
 
 # Days whose pairs are all found and that tuning may look at.

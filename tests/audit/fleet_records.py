@@ -105,14 +105,9 @@ def days_of(records: list[CalibrationRecord], held_sigma_factor: float) -> dict[
 
 
 def _record(
-    vehicle: str,
-    day: int,
-    pair: str,
-    T: np.ndarray,
-    cov: np.ndarray,
-    status: str,
+    vehicle: str, day: int, pair: str, T: np.ndarray, cov: np.ndarray, status: str,
     unobservable: tuple[int, ...],
-) -> CalibrationRecord:
+) -> CalibrationRecord:  # fmt: skip
     parent, child = FRAMES_OF_PAIR[pair]
     prior = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}.get(pair)
     prior = T_CAMERA_LIDAR @ T_LIDAR_RADAR if prior is None else prior

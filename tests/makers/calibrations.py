@@ -9,12 +9,9 @@ from pipeline.rig.se3 import exp_se3
 
 SIGMA = np.array([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
 CAMERA = Camera(
-    "plumb_bob",
-    np.array([[800.0, 0, 640.5], [0, 801.0, 360.25], [0, 0, 1]]),
-    np.array([-0.31, 0.1, 0.001, -0.002, 0.0]),
-    1280,
-    720,
-)
+    "plumb_bob", np.array([[800.0, 0, 640.5], [0, 801.0, 360.25], [0, 0, 1]]),
+    np.array([-0.31, 0.1, 0.001, -0.002, 0.0]), 1280, 720,
+)  # fmt: skip
 # A camera that looks forward, 1 m ahead of the lidar and 0.5 m above it: what lies 10 m ahead of the lidar at its own
 # height is 9 m deep in the image and 0.5 m below its axis.
 T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0.5], [1, 0, 0, -1], [0, 0, 0, 1]])

@@ -108,12 +108,9 @@ def kitti(folder, frames=6, *, second_camera=False):
         (folder / "velodyne" / f"{name}.bin").write_bytes(lidar_points(n).tobytes())
         (folder / "radar" / f"{name}.bin").write_bytes(radar_points(n).astype(np.float32).tobytes())
         lines = {
-            "P2": P,
-            "P3": P3,
-            "R0_rect": np.eye(3),
-            "Tr_velo_to_cam": T_ref_lidar[:3],
+            "P2": P, "P3": P3, "R0_rect": np.eye(3), "Tr_velo_to_cam": T_ref_lidar[:3],
             "Tr_radar_to_velo": T_lidar_radar[:3],
-        }
+        }  # fmt: skip
         text = [f"{key}: {' '.join(map(str, M.ravel()))}" for key, M in lines.items()]
         (folder / "calib" / f"{name}.txt").write_text("\n".join(text) + "\n\n")
     return folder

@@ -33,11 +33,6 @@ def fleet_toml(*vehicles, sections="", lidar="", radar=""):
 
 # A rig of one camera, one lidar and one radar, as FleetConfig takes it.
 THREE_SENSORS = {
-    "camera": {
-        "image": "/i",
-        "info": "/c",
-        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-    },
-    "lidar": {"points": "/p"},
-    "radar": {"points": "/r"},
-}
+    "camera": {"image": "/i", "info": "/c", "semantics": {"source": "topics", "labels": "/l", "detections": "/d"}},
+    "lidar": {"points": "/p"}, "radar": {"points": "/r"},
+}  # fmt: skip

@@ -22,16 +22,8 @@ def converted_street(log, out, day, models):
     kitti_folder(log, given_of(log), out / "data")
     write_real_manifests(out, *models)
     call = [
-        "convert",
-        "kitti",
-        str(out / "data"),
-        "--out",
-        str(out),
-        "--vehicle",
-        day.vehicle,
-        "--day",
-        day.day,
-    ]
+        "convert", "kitti", str(out / "data"), "--out", str(out), "--vehicle", day.vehicle, "--day", day.day,
+    ]  # fmt: skip
     if main([*call, "--segmenter", "segmenter.toml", "--detector", "detector.toml"]):
         raise RuntimeError(f"{log} was not converted")
 

@@ -30,12 +30,9 @@ def write_frames(
 
 
 def write_observations(
-    lake: Lake,
-    partition: Partition,
-    observations: Sequence[Observation],
-    key: str = "observations-key",
+    lake: Lake, partition: Partition, observations: Sequence[Observation], key: str = "observations-key",
     **extra: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Put the observations of such a rig into a lake."""
     _write(lake, partition, PERCEIVED, observations, key, extra)
 

@@ -27,14 +27,9 @@ BEAM_GAP_RAD = np.radians(0.4)
 
 
 def street_day(
-    frames: int = 30,
-    seed: int = 0,
-    *,
-    dt_s: float = DT_S,
-    elevation: bool = True,
-    gaps_s: Sequence[float] = (),
+    frames: int = 30, seed: int = 0, *, dt_s: float = DT_S, elevation: bool = True, gaps_s: Sequence[float] = (),
     **changes,
-) -> list[Observation]:
+) -> list[Observation]:  # fmt: skip
     """A day of streets; `changes` replace columns of every frame; `gaps_s` are radar stamps less the sweeps'."""
     rng = np.random.default_rng(seed)
     base = make_day(frames=frames, seed=seed, per_drive=3)

@@ -46,14 +46,9 @@ class SimulatedDay:
 
 
 def simulated_day(
-    folder: Path,
-    *,
-    environment: str = "urban",
-    rig: str = "demo",
-    seed: int = 21,
-    faults: str = "",
+    folder: Path, *, environment: str = "urban", rig: str = "demo", seed: int = 21, faults: str = "",
     **spec: int,
-) -> SimulatedDay:
+) -> SimulatedDay:  # fmt: skip
     """Simulate, ingest and perceive one day into a folder: about 0.3 CPU seconds a frame for the demo rig."""
     named = parse_faults(faults, [DATE], rig_named(rig))
     about = {"rig": rig, "environments": environment, "seed": seed, "faults": named}

@@ -72,18 +72,11 @@ def make_value(column, rng, free):
         return (rng.normal(size=shape) * 50).astype(column.dtype)
     number = int(rng.integers(0, 1000))
     return {
-        "int64": 1_700_000_000_000_000_000 + number,
-        "int32": number,
-        "float64": number / 7,
-        "string": f"text {number} äß",
-        "bool": bool(number % 2),
-        "binary": rng.bytes(64),
-        "list<string>": ["a", "", f"b{number}"],
-        "list<float64>": [0.5, number / 3],
-        "list<bool>": [True, False],
-        "map<string,float64>": {"x": number / 3, "y": 0.0},
-        "map<string,int64>": {"reason": number},
-    }[column.kind]
+        "int64": 1_700_000_000_000_000_000 + number, "int32": number, "float64": number / 7,
+        "string": f"text {number} äß", "bool": bool(number % 2), "binary": rng.bytes(64),
+        "list<string>": ["a", "", f"b{number}"], "list<float64>": [0.5, number / 3], "list<bool>": [True, False],
+        "map<string,float64>": {"x": number / 3, "y": 0.0}, "map<string,int64>": {"reason": number},
+    }[column.kind]  # fmt: skip
 
 
 def same(a, b):

@@ -57,15 +57,9 @@ DENSE = Rig(FISHEYE, np.arange(-12.0, 6.0, 0.25), 0.25, 30.0, T_TRUE, has_ring=F
 
 
 def traced_day(
-    rig: Rig,
-    frames: int,
-    seed: int,
-    dt_s: float = 0.0,
-    *,
-    reflective: bool = True,
-    gaps_s: Sequence[float] = (),
-    readout_s: float = 0.0,
-) -> list[Observation]:
+    rig: Rig, frames: int, seed: int, dt_s: float = 0.0, *, reflective: bool = True,
+    gaps_s: Sequence[float] = (), readout_s: float = 0.0,
+) -> list[Observation]:  # fmt: skip
     """Observations of independent scenes, six frames to a drive, every third standing; gaps of images to sweeps.
 
     Traced once a process.

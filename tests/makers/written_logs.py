@@ -133,17 +133,10 @@ class Kit:
         return self.stamped(kind, stamp_ns, "camera_optical", binning_x=0, binning_y=0, **fields)
 
     def cloud(
-        self,
-        stamp_ns: int,
-        columns: dict[str, np.ndarray],
-        *,
-        frame_id: str = "lidar",
-        big_endian: bool = False,
-        padding: int = 0,
-        rows: int = 1,
-        row_padding: int = 0,
+        self, stamp_ns: int, columns: dict[str, np.ndarray], *, frame_id: str = "lidar",
+        big_endian: bool = False, padding: int = 0, rows: int = 1, row_padding: int = 0,
         counts: dict[str, int] | None = None,
-    ) -> Any:
+    ) -> Any:  # fmt: skip
         """A PointCloud2 of these columns in this order; dtypes are the columns' own."""
         order, counts, offset, fields, formats = ">" if big_endian else "<", counts or {}, padding, [], []
         for name, values in columns.items():
