@@ -18,12 +18,9 @@ PACKAGES = ("jobs", "pipeline", "schemas")
 PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
 # Where the import name differs.
 DISTRIBUTION_OF = {
-    "cv2": "opencv-python-headless",
-    "foxglove": "foxglove-sdk",
-    "google": "protobuf",
-    "mcap_protobuf": "mcap-protobuf-support",
-    "ruamel": "ruamel.yaml",
-}
+    "cv2": "opencv-python-headless", "foxglove": "foxglove-sdk", "google": "protobuf",
+    "mcap_protobuf": "mcap-protobuf-support", "ruamel": "ruamel.yaml",
+}  # fmt: skip
 # Commands beyond the night: the extra that each needs, and its options as a person would give them. The folders need
 # not exist, since the extra is asked for first.
 NEEDS = {

@@ -210,17 +210,11 @@ def test_slow_drift_and_step_are_told_apart():
         ([0] * 10 + [0.3] * 4, 0.25, 0.08, "YELLOW", "may be above the limit"),
         ([0] * 10 + [0.3] * 4, 0.2, 0.08, "RED", ""),
         ([0] * 4, 0.25, 0.1, "GREEN", ""),
-        (
-            [0] * 4,
-            0.25,
-            0.3,
-            "UNKNOWN",
-            "below 34 deg would not be noticed yet (limit 14 deg); about 20 more",
-        ),
+        ([0] * 4, 0.25, 0.3, "UNKNOWN", "below 34 deg would not be noticed yet (limit 14 deg); about 20 more"),
         ([], 1.0, 0.01, "UNKNOWN", ""),
         ([0, 0], 1.0, 0.01, "UNKNOWN", ""),
     ],
-)
+)  # fmt: skip
 def test_a_chart_s_status_is_that_of_its_days(values, limit, sigma, status, words):
     verdict = _judge(np.array(values, float), limit, sigma)
     assert verdict.status == status

@@ -26,11 +26,8 @@ def fleet_of(prior=None, camera=None, **sections):
     small = {"paper_population": 20, "paper_generations": 10, "search_rotation_deg": 4.0}
     sections["solve"] = small | sections.get("solve", {})
     known = {
-        "fleet": {"name": "f"},
-        "rigs": {"default": rig},
-        "vehicles": {"car 1": {}},
-        "select": {"frames": 16},
-    }
+        "fleet": {"name": "f"}, "rigs": {"default": rig}, "vehicles": {"car 1": {}}, "select": {"frames": 16},
+    }  # fmt: skip
     return FleetConfig.model_validate(known | sections)
 
 
@@ -198,13 +195,10 @@ def test_the_verdicts_thresholds_are_those_of_the_configuration(tmp_path, day):
 @pytest.mark.parametrize(
     ("speeds", "environment"),
     [
-        ([30.0] * 10, "highway"),
-        ([8.0] * 10, "urban"),
-        ([8.0] * 5 + [30.0] * 5, "mixed"),
-        ([None] * 10, "unknown"),
-        ([0.0] * 10, "unknown"),
+        ([30.0] * 10, "highway"), ([8.0] * 10, "urban"), ([8.0] * 5 + [30.0] * 5, "mixed"),
+        ([None] * 10, "unknown"), ([0.0] * 10, "unknown"),
     ],
-)
+)  # fmt: skip
 def test_environment_follows_from_speed(day, speeds, environment):
     assert environment_of([replace(day[0], ego_speed_mps=s) for s in speeds]) == environment
 

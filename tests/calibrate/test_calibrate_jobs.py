@@ -34,14 +34,9 @@ def workplace(tmp_path_factory):
 
 def run(workplace, day="2024-05-06"):
     return calibrate(
-        fleet=workplace / "fleet.toml",
-        lake=str(workplace / "lake"),
-        vehicle="v",
-        day=day,
-        method="pairwise-optimisation",
-        perturb="1,0.05",
-        seed=2,
-    )
+        fleet=workplace / "fleet.toml", lake=str(workplace / "lake"), vehicle="v", day=day,
+        method="pairwise-optimisation", perturb="1,0.05", seed=2,
+    )  # fmt: skip
 
 
 def last_line(capsys):

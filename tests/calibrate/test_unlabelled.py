@@ -50,13 +50,9 @@ def test_the_note_names_what_does_not_check_the_pose(day):
 
 def test_poses_of_the_camera_have_the_note_and_those_of_others_do_not():
     record = make_row(
-        "calibrations",
-        RNG,
-        pair="camera_lidar",
-        parent_frame="front",
-        child_frame="top",
+        "calibrations", RNG, pair="camera_lidar", parent_frame="front", child_frame="top",
         notes=[WITHOUT_LABELS],
-    )
+    )  # fmt: skip
     kinds = {"front": "camera", "left": "camera", "top": "lidar"}
     poses = [make_row("poses", RNG, sensor=s, kind=k, reference="top", notes=[]) for s, k in kinds.items()]
     assert [row.notes for row in noted(poses, [record])] == [[WITHOUT_LABELS], [], []]

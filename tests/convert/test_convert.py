@@ -137,12 +137,7 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
     [
         ("nuscenes", "v1.0-mini/sensor.json", b"[]", "scene.json: no scene has two sensors"),
         ("nuscenes", "v1.0-mini/sample.json", b"{", "sample.json: not readable JSON"),
-        (
-            "nuscenes",
-            "v1.0-mini/sample_data.json",
-            b'[{"token": "a"}]',
-            "sample_data.json: calibrated_sensor",
-        ),
+        ("nuscenes", "v1.0-mini/sample_data.json", b'[{"token": "a"}]', "sample_data.json: calibrated_sensor"),
         ("nuscenes", "samples/LIDAR_TOP/0.pcd.bin", b"123", "0.pcd.bin: 3 bytes are not rows of 5 float32"),
         ("nuscenes", "samples/RADAR_FRONT/0.pcd", b"FIELDS x\n", "0.pcd: not a readable PCD"),
         ("vod", "lidar/training/calib/00000.txt", b"P2: 1 2\n", "00000.txt: P2: needs 12 numbers and has 2"),
@@ -150,7 +145,7 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
         ("vod", "lidar/training/image_2/00000.jpg", b"", "00000.jpg: is not a readable image"),
         ("kitti", "calib/000000.txt", b"P2: one\n", "P2: is not a number"),
     ],
-)
+)  # fmt: skip
 def test_a_broken_file_is_named_and_leaves_no_log(name, file, content, words, tmp_path, capsys):
     MAKERS[name](tmp_path / "data")
     (tmp_path / "data" / file).write_bytes(content)

@@ -9,26 +9,21 @@ from pipeline.core.errors import ConfigError
 from pipeline.evaluate.recording import find_again, read_reflectors
 
 CAMERA = {
-    "model": "plumb_bob",
-    "K": [[500, 0, 320], [0, 500, 160], [0, 0, 1]],
-    "D": [],
-    "width_px": 640,
+    "model": "plumb_bob", "K": [[500, 0, 320], [0, 500, 160], [0, 0, 1]], "D": [], "width_px": 640,
     "height_px": 320,
-}
+}  # fmt: skip
 AT = np.array([[15.0, -2.0, 0.1], [25.0, 3.0, 0.2]])
 
 
 def content(**more):
     targets = [
         {
-            "pixel": [300.0, 150.0],
-            "lidar_m": at.tolist(),
-            "radar_m": at.tolist(),
+            "pixel": [300.0, 150.0], "lidar_m": at.tolist(), "radar_m": at.tolist(),
             "spread": {"pixel": [0.5, 0.5], "lidar_m": [0.02] * 3, "radar_m": [0.1, 0.1, 0.6]},
             "frames": {"pixel": 1, "lidar_m": 4, "radar_m": 144},
         }
         for at in AT
-    ]
+    ]  # fmt: skip
     return {"camera": CAMERA, "targets": targets} | more
 
 

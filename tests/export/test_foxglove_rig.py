@@ -23,12 +23,9 @@ pytest.importorskip("foxglove")
 DAY, COUNT = Partition("van", "2026-03-01"), 3
 # By sensor, the kind of the row that it has, and whose of another day.
 SENSORS = {
-    "front": ("camera", 0),
-    "left": ("camera", 10),
-    "top": ("lidar", 0),
-    "bumper": ("radar", 0),
+    "front": ("camera", 0), "left": ("camera", 10), "top": ("lidar", 0), "bumper": ("radar", 0),
     "corner": ("radar", 10),
-}
+}  # fmt: skip
 RECORDS = rig_records("van", 1, np.random.default_rng(4))
 AROUND = np.random.default_rng(7).uniform((-30, -30, -1), (30, 30, 2), (60, 3)).astype(np.float32)
 

@@ -60,12 +60,8 @@ def test_warnings_frames_and_sigma_are_in_the_file_or_beside_it(name, tmp_path):
     sent = calibration()
     pair = sent.pairs["lidar_radar"]
     held = replace(
-        pair,
-        status="held",
-        reason="roll -- halves\ndisagree",
-        observable=(True,) * 5 + (False,),
-        certified=(),
-    )
+        pair, status="held", reason="roll -- halves\ndisagree", observable=(True,) * 5 + (False,), certified=(),
+    )  # fmt: skip
     whole = replace(sent.pairs["camera_lidar"], reason="since it moved")  # no warning: all of it is certified
     pairs = sent.pairs | {"camera_lidar": whole, "lidar_radar": held}
     files = written_files(format_named(name), calibration(pairs=pairs), tmp_path / "o")

@@ -59,11 +59,8 @@ def test_days_are_filtered_and_come_in_order(tmp_path):
     pattern = str(tmp_path / "{vehicle}/{day}/*")
     days = find_vehicle_days(pattern, "2026-03-02", "2026-03-03")
     assert [(d.partition.day, d.partition.vehicle) for d in days] == [
-        ("2026-03-02", "a"),
-        ("2026-03-02", "b"),
-        ("2026-03-03", "a"),
-        ("2026-03-03", "b"),
-    ]
+        ("2026-03-02", "a"), ("2026-03-02", "b"), ("2026-03-03", "a"), ("2026-03-03", "b"),
+    ]  # fmt: skip
     assert find_vehicle_days(pattern, "2027-01-01") == []
 
 

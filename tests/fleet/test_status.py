@@ -80,13 +80,9 @@ def test_a_vehicle_day_counts_once_by_the_method_that_is_asked_for():
 @pytest.mark.parametrize(
     ("days", "word"),
     [
-        (["done", "partly"], "partly"),
-        (["partly"], "partly"),
-        (["cached", "held"], "partly"),
-        (["held", "held"], "held"),
-        (["refused"], "refused"),
-        (["done", "cached"], "incomplete"),
+        (["done", "partly"], "partly"), (["partly"], "partly"), (["cached", "held"], "partly"),
+        (["held", "held"], "held"), (["refused"], "refused"), (["done", "cached"], "incomplete"),
     ],
-)
+)  # fmt: skip
 def test_the_word_of_a_night_is_that_of_its_days_if_they_agree(days, word):
     assert night_word(days) == word

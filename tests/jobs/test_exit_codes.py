@@ -62,14 +62,8 @@ def rig_of(folder: Path, **rigs: str) -> Path:
 def night(folder: Path, lake: Path | None = None) -> list[str]:
     logs = f"{folder}/logs/{{vehicle}}/{{day}}/*"
     options = [
-        "--lake",
-        f"{lake or folder / 'lake'}",
-        "--logs",
-        logs,
-        "--executor",
-        "inline",
-        "--no-pictures",
-    ]
+        "--lake", f"{lake or folder / 'lake'}", "--logs", logs, "--executor", "inline", "--no-pictures",
+    ]  # fmt: skip
     return ["nightly", "--fleet", f"{folder}/fleet.toml", *options]
 
 

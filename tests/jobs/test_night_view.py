@@ -29,11 +29,8 @@ def test_without_a_terminal_every_vehicle_day_that_ends_is_one_json_line(capsys)
     show()
     lines = [line for line in lines_of(capsys) if line["event"] != "stage"]
     assert [(line["level"], line.get("status")) for line in lines] == [
-        ("info", "done"),
-        ("error", "failed"),
-        ("info", "refused"),
-        ("info", None),
-    ]
+        ("info", "done"), ("error", "failed"), ("info", "refused"), ("info", None),
+    ]  # fmt: skip
     assert lines[1]["trace"].startswith("Traceback")
     assert (lines[2]["ended"], lines[2]["total"]) == (3, 4)
 

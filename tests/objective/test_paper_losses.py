@@ -79,12 +79,9 @@ def euler_matrix(angles):
 
 def test_frames_without_anything_to_compare_say_so():
     empty = make_day(
-        2,
-        radar_track_xyz_m=np.zeros((0, 3), np.float32),
-        radar_drivable_azimuth_rad=np.zeros(0, np.float32),
-        radar_drivable_range_m=np.zeros(0, np.float32),
-        lidar_map_cluster=np.full(780, -1, np.int32),
-    )
+        2, radar_track_xyz_m=np.zeros((0, 3), np.float32), radar_drivable_azimuth_rad=np.zeros(0, np.float32),
+        radar_drivable_range_m=np.zeros(0, np.float32), lidar_map_cluster=np.full(780, -1, np.int32),
+    )  # fmt: skip
     for pair in TRUTH:
         loss = loss_of(pair, empty)
         assert not loss.informative.any()

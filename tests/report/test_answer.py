@@ -63,30 +63,22 @@ def sensor(name, status="current", certified="azimuth, elevation"):
     ("loaded", "verdict", "words"),
     [
         (
-            [sensor("nose", certified="azimuth"), sensor("front")],
-            "good",
+            [sensor("nose", certified="azimuth"), sensor("front")], "good",
             "Yes. Load tonight's state: all sensors are certified, in azimuth or elevation at least. "
             + NAMED.replace("lidar-radar", "nose"),
         ),
         (
-            [
-                sensor("front", certified="elevation"),
-                sensor("left", certified=""),
-                sensor("nose", "prior", ""),
-            ],
+            [sensor("front", certified="elevation"), sensor("left", certified=""), sensor("nose", "prior", "")],
             "partly",
-            (
-                "Partly. Load tonight's state. Certified: front. Used, but not certified: left. At the prior: nose. "
-                "Certified in elevation only: front."
-            ),
+            ("Partly. Load tonight's state. Certified: front. Used, but not certified: left. At the prior: nose. "
+             "Certified in elevation only: front."),
         ),
         (
-            [sensor("left", certified=""), sensor("nose", "prior", "")],
-            "bad",
+            [sensor("left", certified=""), sensor("nose", "prior", "")], "bad",
             "No. Nothing in tonight's state is certified: keep what the car has.",
         ),
     ],
-)
+)  # fmt: skip
 def test_a_page_that_shows_the_state_of_tonight_answers_for_it_and_not_for_the_day(loaded, verdict, words):
     pair = Answered("top-nose", "accepted", ("top", "nose"), "azimuth")
     held = answered([pair], [pose("left", "camera", "held"), pose("front", "camera")])

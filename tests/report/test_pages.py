@@ -107,16 +107,11 @@ def test_the_truth_table_counts_the_axes_within_three_sigmas(fleet):
     ("vehicle", "day", "answer", "kind"),
     [
         ("b", "2026-03-04", "Yes. All pairs are accepted", "good"),
-        (
-            "b",
-            "2026-03-01",
-            "Not any more. The radar moved on 2026-03-03, after this day. Only camera",
-            "bad",
-        ),
+        ("b", "2026-03-01", "Not any more. The radar moved on 2026-03-03, after this day. Only camera", "bad"),
         ("c", "2026-03-03", "No. Nothing was accepted", "bad"),
         ("c", "2026-03-04", "No. Nothing was accepted", "bad"),
     ],
-)
+)  # fmt: skip
 def test_a_day_page_answers_first_whether_its_numbers_can_be_trusted(
     fleet, tmp_path, vehicle, day, answer, kind
 ):

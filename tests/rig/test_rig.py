@@ -84,29 +84,20 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         (('reference = "top"', 'reference = "base"'), "reference = 'base' is no sensor"),
         (('reference = "top"', 'reference = ["top", "nose"]'), "van.reference: the reference is one sensor"),
         (('reference = "top"', 'reference = "corner_fl"'), "corner_fl is the reference"),
-        (
-            ('base = "base_link"', 'edges = [["front", "roof"]]'),
-            "[front, roof]: the rig has front, left, top",
-        ),
+        (('base = "base_link"', 'edges = [["front", "roof"]]'), "[front, roof]: the rig has front, left, top"),
         (('base = "base_link"', 'edges = [["top", "top"]]'), "[top, top]: an edge joins two sensors"),
         (('base = "base_link"', 'edges = [["front", "left"]]'), "cannot be calibrated against each other"),
         (('base = "base_link"', 'edges = [["top", "base"]]'), "no base (set base ="),
         (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] occurs twice"),
         (('base = "base_link"', "edges = []"), "edges is empty"),
-        (
-            ('base = "base_link"', 'three = ["front", "top", "nose"]'),
-            "three = [front, top, nose]: name a camera",
-        ),
+        (('base = "base_link"', 'three = ["front", "top", "nose"]'), "three = [front, top, nose]: name a camera"),
         (('base = "base_link"', 'three = ["front", "top"]'), "van.three"),
         (('base = "base_link"', 'base = ""'), "van.base"),
         (('base = "base_link"', "road_z_m = -0.3"), "road_z_m needs the vehicle frame"),
-        (
-            ('points = "/top/points"', 'points = "/top/points"\nheight_m = 1.8'),
-            "height_m and height_sigma_m go",
-        ),
+        (('points = "/top/points"', 'points = "/top/points"\nheight_m = 1.8'), "height_m and height_sigma_m go"),
         (('"/nose/points"', '"points"'), "rigs.van.lidars.nose.points"),
     ],
-)
+)  # fmt: skip
 def test_a_rig_that_cannot_be_right_is_refused_by_what_is_wrong_with_it(change, said, tmp_path):
     assert change[0] in VAN
     with pytest.raises(ConfigError) as caught:
@@ -118,14 +109,10 @@ def test_a_rig_that_cannot_be_right_is_refused_by_what_is_wrong_with_it(change, 
 @pytest.mark.parametrize(
     ("sensors", "is_enough"),
     [
-        (("cameras", "lidars"), True),
-        (("lidars", "lidars"), True),
-        (("lidars",), False),
-        (("cameras", "cameras"), False),
-        (("radars", "radars"), False),
-        ((), False),
+        (("cameras", "lidars"), True), (("lidars", "lidars"), True), (("lidars",), False),
+        (("cameras", "cameras"), False), (("radars", "radars"), False), ((), False),
     ],
-)
+)  # fmt: skip
 def test_a_rig_that_can_have_no_edge_is_refused(sensors, is_enough, tmp_path):
     topics = {"cameras": 'image = "/{0}"\ninfo = "/i{0}"\n'}
     tables = [

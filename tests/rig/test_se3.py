@@ -190,13 +190,8 @@ def test_spherical_jacobian_agrees_with_central_differences():
 def test_transforms_are_found_along_the_tree_in_both_directions():
     rng = np.random.default_rng(1)
     parents = {
-        "base": "map",
-        "kit": "base",
-        "camera": "kit",
-        "lidar": "kit",
-        "radar": "base",
-        "island": "alone",
-    }
+        "base": "map", "kit": "base", "camera": "kit", "lidar": "kit", "radar": "base", "island": "alone",
+    }  # fmt: skip
     T_map = {"map": np.eye(4), "alone": np.eye(4)}
     tree = TransformTree()
     for child, parent in parents.items():

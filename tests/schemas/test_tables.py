@@ -33,18 +33,10 @@ def test_the_arrow_schema_tells_dtype_and_shape_of_every_array(table):
 def json_value(column):
     """A value as JSON carries it."""
     value = {
-        "int64": 3,
-        "int32": 3,
-        "float64": 0.5,
-        "string": "x",
-        "bool": True,
-        "binary": base64.b64encode(b"abc").decode(),
-        "list<string>": ["a"],
-        "list<float64>": [0.5],
-        "list<bool>": [True],
-        "map<string,float64>": {"a": 0.5},
-        "map<string,int64>": {"a": 1},
-    }
+        "int64": 3, "int32": 3, "float64": 0.5, "string": "x", "bool": True,
+        "binary": base64.b64encode(b"abc").decode(), "list<string>": ["a"], "list<float64>": [0.5],
+        "list<bool>": [True], "map<string,float64>": {"a": 0.5}, "map<string,int64>": {"a": 1},
+    }  # fmt: skip
     return value[column.kind]
 
 

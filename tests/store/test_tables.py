@@ -237,11 +237,8 @@ def test_leftovers_go_when_their_writer_is_dead_or_a_day_has_passed(lake, rng):
     host = socket.gethostname()
     dead = next(pid for pid in range(4_000_000, 3_000_000, -1) if not psutil.pid_exists(pid))
     written_by = {
-        "dead": f"{host}-{dead}",
-        "alive": f"{host}-{os.getppid()}",
-        "elsewhere": "other-host-1",
-        "old": "o-1",
-    }
+        "dead": f"{host}-{dead}", "alive": f"{host}-{os.getppid()}", "elsewhere": "other-host-1", "old": "o-1",
+    }  # fmt: skip
     files = {key: folder / f".writing-{name}-aa.tmp" for key, name in written_by.items()}
     for path in files.values():
         path.write_bytes(b"half")

@@ -167,15 +167,10 @@ def run(*args, env=None, path=()):
     ("raised", "env", "more", "words"),
     [
         ("libGL.so.1: cannot open shared object file: No such file", {}, ["--out", "a.png"], "libgl1"),
-        (
-            "",
-            {"VK_DRIVER_FILES": "/no", "VK_ICD_FILENAMES": "/no"},
-            ["--out", "a.png"],
-            "mesa-vulkan-drivers",
-        ),
+        ("", {"VK_DRIVER_FILES": "/no", "VK_ICD_FILENAMES": "/no"}, ["--out", "a.png"], "mesa-vulkan-drivers"),
         ("", {}, [], "--out FILE.png"),
     ],
-)
+)  # fmt: skip
 def test_a_machine_without_what_open3d_needs_is_told_what_to_do(tmp_path, raised, env, more, words):
     if words.startswith("--out"):
         try:

@@ -68,13 +68,11 @@ def test_frames_whose_velocity_is_a_convoys_are_named(day, error):
 def test_what_the_car_does_not_log_contradicts_nothing(day):
     silent = [
         replace(
-            o,
-            ego_speed_mps=None,
-            ego_yaw_rate_radps=None,
+            o, ego_speed_mps=None, ego_yaw_rate_radps=None,
             radar_velocity_mps=o.radar_velocity_mps + [0, 3.0 * (k < 3), 0],
         )
         for k, o in enumerate(day)
-    ]
+    ]  # fmt: skip
     assert not contradicts_odometry(silent).any()
     assert turns_unmeasured(silent)[:3].all()
     blind = spoiled(silent, {5}, lambda _: {"radar_velocity_mps": None})
@@ -139,14 +137,10 @@ def problem():
 def problem_of(rows):
     rng = np.random.default_rng(0)
     return RadarProblem(
-        rows,
-        registration_frames(rows, T_LIDAR_RADAR, rng),
-        moving_clusters(rows, with_boxes=False),
-        Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05),
-        0.05,
-        np.radians(0.4),
+        rows, registration_frames(rows, T_LIDAR_RADAR, rng), moving_clusters(rows, with_boxes=False),
+        Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05), 0.05, np.radians(0.4),
         ElevationSpread(0.1, 0.5),
-    )
+    )  # fmt: skip
 
 
 def state_at(dt_s):
@@ -185,13 +179,10 @@ def tunnel_day(frames, seed=3):
         cloud, seen = walls(9000, -10, 80), transform_points(inverse(T_LIDAR_RADAR), walls(220, 3, 60))
         noisy = from_spherical(to_spherical(seen) + rng.normal(size=seen.shape) * SIGMA)
         yield replace(
-            o,
-            **radar,
-            lidar_map_xyz_m=cloud.astype(np.float32),
+            o, **radar, lidar_map_xyz_m=cloud.astype(np.float32),
             lidar_map_is_ground=np.zeros(len(cloud), np.uint8),
-            lidar_map_cluster=np.full(len(cloud), -1, np.int32),
-            radar_xyz_m=noisy.astype(np.float32),
-        )
+            lidar_map_cluster=np.full(len(cloud), -1, np.int32), radar_xyz_m=noisy.astype(np.float32),
+        )  # fmt: skip
 
 
 def test_a_time_offset_that_blocks_of_frames_find_anywhere_is_unsure_and_one_they_agree_on_is_not(problem):

@@ -41,10 +41,8 @@ def prior():
     rng = np.random.default_rng(3)
     return Prior(
         perturb_exactly(T_CAMERA_LIDAR, np.radians(2), 0.1, rng),
-        perturb_exactly(T_LIDAR_RADAR, np.radians(2), 0.1, rng),
-        np.radians(2),
-        0.1,
-    )
+        perturb_exactly(T_LIDAR_RADAR, np.radians(2), 0.1, rng), np.radians(2), 0.1,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,10 @@ STAMP = 1_700_000_000_123_456_789
 
 @settings(max_examples=60, deadline=None)
 @given(
-    big_endian=st.booleans(),
-    padding=st.integers(0, 5),
-    rows=st.sampled_from([1, 4]),
+    big_endian=st.booleans(), padding=st.integers(0, 5), rows=st.sampled_from([1, 4]),
     row_padding=st.integers(0, 7),
-    kinds=st.lists(st.sampled_from(["f4", "f8", *INTEGER]), min_size=1, max_size=6),
-    seed=st.integers(0, 1000),
-)
+    kinds=st.lists(st.sampled_from(["f4", "f8", *INTEGER]), min_size=1, max_size=6), seed=st.integers(0, 1000),
+)  # fmt: skip
 def test_any_layout_gives_back_its_columns(kit, big_endian, padding, rows, row_padding, kinds, seed):
     rng = np.random.default_rng(seed)
     columns = {f"f{i}": column(kind, rng) for i, kind in enumerate(kinds)}

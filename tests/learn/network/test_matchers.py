@@ -180,13 +180,9 @@ def radar_left(xi, seed=0, *, elevation=True, passes=3):
         for _ in range(passes):
             moved = radar @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]
             found = matcher(
-                moved,
-                torch.zeros_like(moved),
-                real,
-                torch.tensor([elevation]),
-                objects,
+                moved, torch.zeros_like(moved), real, torch.tensor([elevation]), objects,
                 torch.ones(1, objects.shape[1]),
-            )
+            )  # fmt: skip
             T = pose_of_twist(found.twist) @ T
     return np.degrees(small_rotation_vector(T[:, :3, :3])[0].numpy()), T[0, :3, 3].numpy(), found
 

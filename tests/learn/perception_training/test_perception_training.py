@@ -277,14 +277,8 @@ def scans_lake(lake):
 
 JOBS = {
     "lidar_semantics": (sweeps_lake, ["--rows", "24"], RangeImageSegmenter, (3, 4), {"iou_ground"}),
-    "radar_drivable": (
-        scans_lake,
-        [],
-        RadarDrivable,
-        (4, 4),
-        {"iou_network", "iou_geometric", "iou_constant"},
-    ),
-}
+    "radar_drivable": (scans_lake, [], RadarDrivable, (4, 4), {"iou_network", "iou_geometric", "iou_constant"}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("task", TASKS)
