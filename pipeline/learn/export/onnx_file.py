@@ -21,7 +21,7 @@ from torch.jit._trace import TracerWarning
 
 from pipeline.core.errors import ConfigError
 from pipeline.learn.infer.onnx_networks import UNFIT
-from pipeline.learn.network.calibration_network import WEIGHTS, CalibrationNetwork, weight_places
+from pipeline.learn.network.calibration_network import CalibrationNetwork, weight_places
 from pipeline.learn.network.views import RenderedView
 from pipeline.learn.sample.grid import (
     EVIDENCE,
@@ -36,6 +36,7 @@ from pipeline.learn.sample.grid import (
     RADAR_POINTS,
     NetworkConfig,
 )  # fmt: skip
+from pipeline.learn.sample.weights import WEIGHTS
 from pipeline.learn.train.loop import BEST, LAST, load_checkpoint, read_metrics
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION

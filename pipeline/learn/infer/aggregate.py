@@ -147,10 +147,10 @@ def day_estimate(
 
 
 def measured_estimate(
-    T: Float[np.ndarray, "4 4"], information: Float[np.ndarray, "6 6"], bias_sigma: Float[np.ndarray, " 6"],
+    pair: str, T: Float[np.ndarray, "4 4"], information: Float[np.ndarray, "6 6"], bias_sigma: Float[np.ndarray, " 6"],
     T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"], frames: int,
 ) -> PairEstimate:  # fmt: skip
-    """Estimate of camera-lidar from a fit of all frames under the prior, with an error common to all frames.
+    """Estimate of a pair from a fit of all frames under the prior, with an error common to all frames.
 
     Args:
         T: the peak of frames and prior together.
@@ -175,7 +175,7 @@ def measured_estimate(
     covariance = back @ (keep @ P @ keep.T + gain @ told @ gain.T) @ back.T
     covariance = (covariance + covariance.T) / 2
     return PairEstimate(
-        "camera_lidar", exp_se3(x) @ T, covariance, observability, observable, frames,
+        pair, exp_se3(x) @ T, covariance, observability, observable, frames,
         common_covariance=common_of(covariance, prior_covariance, back @ bias @ back.T),
     )  # fmt: skip
 

@@ -1,12 +1,11 @@
 """Camera-lidar evidence of one frame at any pose: classes of lidar points on the camera's class likelihoods.
 
 A network looks at shifts of whole cells within one frame. This module scores the same maps and points at a
-pose, with the gradient of the score, so that `joint_fit` can use all frames of a day at one pose.
+pose, with the gradient of the score, so that `joint_day` can use all frames of a day at one pose.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import no_type_check
 
@@ -15,10 +14,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from pipeline.learn.sample.grid import NEAR_M, Grid
-from pipeline.rig.se3 import exp_se3
 from schemas.training import GRID_CLASSES
 
-__all__ = ["FrameEvidence", "scores"]
+__all__ = ["FrameEvidence"]
 
 _BEHIND = -5.0  # log-likelihood of a point behind the camera: the floor of the maps
 
@@ -45,26 +43,16 @@ class FrameEvidence:
         """Kind of evidence of each map: 0 for all classes together, then edges on boundaries, then paint."""
         return np.maximum(np.arange(self.maps.shape[2]) - (len(GRID_CLASSES) - 1), 0)
 
-
-def scores(
-    frames: Sequence[FrameEvidence], T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float = 0.0
-) -> tuple[Float[np.ndarray, "F E"], Float[np.ndarray, "F E 7"]]:
-    """Mean expected log-likelihood of each frame's points by kind of evidence, and its gradient.
-
-    The gradient is by a left twist and by `dt_s` (per rad, per m, per s): stamp_camera = stamp_lidar + dt. Points are
-    where a standing world has them when the image is taken. All frames have the same kinds.
-    """
-    kinds = frames[0].kinds
-    value, gradient = np.zeros((len(frames), kinds[-1] + 1)), np.zeros((len(frames), kinds[-1] + 1, 7))
-    travel, late_s = np.stack([f.travel for f in frames]), np.array([dt_s - f.lag_s for f in frames])
-    T = T_camera_lidar @ exp_se3(late_s[:, None] * travel)
-    for i, f in enumerate(frames):
-        limits = np.radians([f.grid.top_deg, f.grid.left_deg, f.grid.cell_deg])
-        _score(f.points_m, f.probability, f.worth, f.maps, T[i, :3], limits, kinds, value[i], gradient[i])
-    turn, shift = np.einsum("fij,fkj->kfi", T[:, :3, :3], travel.reshape(-1, 2, 3))
-    by_clock = np.concatenate([turn, shift + np.cross(T[:, :3, 3], turn)], axis=1)
-    gradient[..., 6] = np.einsum("fei,fi->fe", gradient[..., :6], by_clock)
-    return value, gradient
+    def score(
+        self, T_camera_lidar: Float[np.ndarray, "4 4"]
+    ) -> tuple[Float[np.ndarray, " E"], Float[np.ndarray, "E 6"]]:
+        """Mean expected log-likelihood of the points by kind, and its gradient by a left twist (per rad, per m)."""
+        kinds, grid = self.kinds, self.grid
+        value, gradient = np.zeros(kinds[-1] + 1), np.zeros((kinds[-1] + 1, 6))
+        limits = np.radians([grid.top_deg, grid.left_deg, grid.cell_deg])
+        given = self.points_m, self.probability, self.worth, self.maps
+        _score(*given, T_camera_lidar[:3], limits, kinds, value, gradient)
+        return value, gradient
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code

@@ -1,4 +1,8 @@
-"""Camera-lidar of a vehicle-day and its clock from all frames together: candidates, vote, climb, covariance."""
+"""A pair of a vehicle-day and its clock from all frames together: candidates, vote, climb, covariance.
+
+Camera-lidar by the classes of points in the image (`class_evidence`), lidar-radar by detections at the lidar's objects
+(`radar_evidence`).
+"""
 
 from __future__ import annotations
 
@@ -10,23 +14,29 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 
 from pipeline.learn.infer.aggregate import measured_estimate
-from pipeline.learn.infer.class_evidence import FrameEvidence, scores
+from pipeline.learn.infer.class_evidence import FrameEvidence
+from pipeline.learn.infer.radar_evidence import RadarEvidence
 from pipeline.rig.estimates import Check, PairEstimate
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
 __all__ = [
-    "APART_RAD", "JOINT_BIAS_SIGMA", "Expected", "JointDay", "JointFit", "climbed", "fit_of", "fitted_day",
-    "likelihood", "rival_score", "voted",
+    "APART_RAD", "JOINT_BIAS_SIGMA", "Evidence", "Expected", "JointDay", "JointFit", "climbed", "fit_of", "fitted_day",
+    "likelihood", "rival_score", "scores", "voted",
 ]  # fmt: skip
 
-_Place = tuple[np.ndarray, float]  # T_camera_lidar, and the clock beyond what is expected [s]
+Evidence = FrameEvidence | RadarEvidence  # of one frame; points of the child, seen by the parent
+_Place = tuple[np.ndarray, float]  # T of the pair, and the clock beyond what is expected [s]
 
 _ROUNDS, _CONVERGED_RAD = 3, np.radians(0.1)  # of choosing points anew where the fit has turned
 _CLEAR_SIGMAS = 3.0  # by which frames must prefer the fit to the best other place
-# Sigma of what all frames err by alike, (bearing rotation [rad], translation [m]) in the camera's frame: chosen by how
-# far days of several rigs err beyond their sigma. Ahead they err by 0.1 m, to one side: labels reach beyond their
+# Sigma of what all frames err by alike, (bearing rotation [rad], translation [m]) in the parent's frame: chosen by how
+# far days of several rigs err beyond their sigma. Ahead cameras err by 0.1 m, to one side: labels reach beyond their
 # things. How far kinds of evidence disagree on a day was tried in its place: in the valleys of few scenes it explodes.
-JOINT_BIAS_SIGMA = np.array([*np.radians([0.05, 0.03, 0.1]), 0.015, 0.015, 0.15])
+# A real radar's detections, which the road mirrors, lean by 4 deg to one side on every log (`FRAME_SIGMA`).
+JOINT_BIAS_SIGMA = {
+    "camera_lidar": np.array([*np.radians([0.05, 0.03, 0.1]), 0.015, 0.015, 0.15]),
+    "lidar_radar": np.array([*np.radians([3.5, 0.2, 0.05]), 0.15, 0.07, 0.4]),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +44,10 @@ class Expected:
     """What is known before the day.
 
     Args:
-        T: T_camera_lidar.
+        T: T_camera_lidar or T_lidar_radar.
         covariance: of its left twist [rad, m].
-        clock_sigma_s: of the camera's clock against the lidar's, by which stamps may be apart besides `clock_s`.
-        clock_s: constant gap of the stamps, as if the sensors measured together: stamp_camera = stamp_lidar + dt.
+        clock_sigma_s: of one clock against the other, by which stamps may be apart besides `clock_s`.
+        clock_s: what the stamps are expected to differ by: stamp_parent = stamp_child + dt.
     """
 
     T: Float[np.ndarray, "4 4"]
@@ -55,23 +65,25 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class JointDay:
-    """A day's frames with their fit, and checks that it failed."""
+    """A pair on a day's frames with its fit, and checks that it failed."""
 
-    frames: Sequence[FrameEvidence]
+    pair: str
+    frames: Sequence[Evidence]
     block: Int[np.ndarray, " F"]
     expected: Expected
     fit: JointFit
     failed: list[Check]
 
     def estimate(self, rows: Bool[np.ndarray, " F"] | None = None) -> PairEstimate:
-        """Of camera-lidar, by all frames or by some."""
+        """Of the pair, by all frames or by some."""
         fit, expected = self.fit, self.expected
         if rows is not None:
             some = [frame for frame, kept in zip(self.frames, rows, strict=True) if kept]
             fit = fit_of(some, self.block[rows], (fit.T, fit.dt_s), expected)
         found = measured_estimate(
-            fit.T, fit.of_pose(expected), JOINT_BIAS_SIGMA, expected.T, expected.covariance, fit.frames
-        )
+            self.pair, fit.T, fit.of_pose(expected), JOINT_BIAS_SIGMA[self.pair], expected.T, expected.covariance,
+            fit.frames,
+        )  # fmt: skip
         sigma_s = float(np.sqrt(np.linalg.inv(fit.information + expected.precision)[6, 6]))
         return replace(
             found,
@@ -82,11 +94,9 @@ class JointDay:
 
 
 def fitted_day(
-    evidence: Callable[[np.ndarray], list[FrameEvidence]],
-    block: Int[np.ndarray, " F"],
-    candidates: Sequence[Float[np.ndarray, "4 4"]],
-    expected: Expected,
-) -> JointDay | None:
+    pair: str, evidence: Callable[[np.ndarray], Sequence[Evidence]], block: Int[np.ndarray, " F"],
+    candidates: Sequence[Float[np.ndarray, "4 4"]], expected: Expected,
+) -> JointDay | None:  # fmt: skip
     """Vote, optimise and select points again until the fit is stable; None if the network has no evidence.
 
     Args:
@@ -112,7 +122,7 @@ def fitted_day(
         T, dt_s = fit.T, fit.dt_s
         if float(rotation_angle_rad(T @ inverse(before))) < _CONVERGED_RAD:
             break
-    return JointDay(frames, block, expected, fit, failed)
+    return JointDay(pair, frames, block, expected, fit, failed)
 
 
 def _not_clear(sigmas: float, T: np.ndarray, T_rival: np.ndarray) -> list[Check]:
@@ -150,8 +160,24 @@ class JointFit:
         return np.asarray(H - np.outer(h, h) / (self.information[6, 6] + expected.precision[6, 6]))
 
 
+def scores(
+    frames: Sequence[Evidence], T: Float[np.ndarray, "4 4"], dt_s: float = 0.0
+) -> tuple[Float[np.ndarray, "F E"], Float[np.ndarray, "F E 7"]]:
+    """Mean log-likelihood of each frame's points by kind of evidence, and its gradient.
+
+    The gradient is by a left twist and by `dt_s` (per rad, per m, per s): stamp_parent = stamp_child + dt. Points are
+    where a standing world has them when the parent measures. All frames have the same kinds.
+    """
+    travel, late_s = np.stack([f.travel for f in frames]), np.array([dt_s - f.lag_s for f in frames])
+    T_late = T @ exp_se3(late_s[:, None] * travel)
+    value, by_pose = map(np.stack, zip(*(f.score(T_late[i]) for i, f in enumerate(frames)), strict=True))
+    turn, shift = np.einsum("fij,fkj->kfi", T_late[:, :3, :3], travel.reshape(-1, 2, 3))
+    by_clock = np.concatenate([turn, shift + np.cross(T_late[:, :3, 3], turn)], axis=1)
+    return value, np.concatenate([by_pose, np.einsum("fei,fi->fe", by_pose, by_clock)[..., None]], axis=2)
+
+
 def voted(
-    frames: Sequence[FrameEvidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
+    frames: Sequence[Evidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The candidates, those first that frames spread over the day fit best."""
     voters = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _VOTERS).astype(int))]
@@ -159,7 +185,7 @@ def voted(
 
 
 def likelihood(
-    looks: Sequence[FrameEvidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
+    looks: Sequence[Evidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
 ) -> Float[np.ndarray, " C"]:
     """Relative likelihood of poses by one frame, whose points were chosen in several ways; its sum is 1."""
     fitting = _FIRST_WORTH * _fitting(looks, candidates) / len(looks)
@@ -168,13 +194,13 @@ def likelihood(
 
 
 def _fitting(
-    frames: Sequence[FrameEvidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
+    frames: Sequence[Evidence], candidates: Sequence[Float[np.ndarray, "4 4"]]
 ) -> Float[np.ndarray, " C"]:
     return np.array([scores(frames, T)[0].sum() for T in candidates])
 
 
 def climbed(
-    frames: Sequence[FrameEvidence],
+    frames: Sequence[Evidence],
     start: _Place,
     expected: Expected,
     worth: float | Float[np.ndarray, " E"] = _FIRST_WORTH,
@@ -198,7 +224,7 @@ def climbed(
 
 
 def fit_of(
-    frames: Sequence[FrameEvidence], block: Int[np.ndarray, " F"], start: _Place, expected: Expected
+    frames: Sequence[Evidence], block: Int[np.ndarray, " F"], start: _Place, expected: Expected
 ) -> JointFit:
     """Optimise from a start, and estimate the peak's sigma; errors within a `block` (scene) are correlated."""
     at, worth = start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
@@ -216,7 +242,7 @@ def fit_of(
 
 
 def rival_score(
-    frames: Sequence[FrameEvidence], block: Int[np.ndarray, " F"], place: _Place, rival: _Place
+    frames: Sequence[Evidence], block: Int[np.ndarray, " F"], place: _Place, rival: _Place
 ) -> float:
     """By how many sigmas of the scenes' scatter frames prefer a pose to its rival; infinite where both are one peak."""
     if float(rotation_angle_rad(place[0] @ inverse(rival[0]))) < APART_RAD:
@@ -236,7 +262,7 @@ def _worth(H: np.ndarray, J: np.ndarray) -> float:
     return float(1 / np.mean(scatter[curved] / values[curved]))
 
 
-def _curvature(frames: Sequence[FrameEvidence], place: _Place) -> Float[np.ndarray, "E 7 7"]:
+def _curvature(frames: Sequence[Evidence], place: _Place) -> Float[np.ndarray, "E 7 7"]:
     """Of the sum over frames, by kind of evidence; positive at a peak."""
     (T, dt_s), H = place, []
     for k, h in enumerate(_STEP):

@@ -24,10 +24,13 @@ from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 from pipeline.core.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.core.errors import ConfigError, ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
+from pipeline.learn.infer.joint_day import Evidence
+from pipeline.learn.infer.radar_evidence import RadarEvidence
 from pipeline.learn.infer.vehicle_day import FrameAnswer
 from pipeline.learn.sample.frame_sample import About, class_likelihood, sensor_row
 from pipeline.learn.sample.grid import EVIDENCE, Grid, NetworkConfig
-from pipeline.learn.sample.rendering import FrameSensors, frame_sensors, render_frame
+from pipeline.learn.sample.rendering import FrameSensors, frame_sensors, object_points, render_frame
+from pipeline.learn.sample.weights import WEIGHTS, listed_weights
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.estimates import Prior
@@ -118,6 +121,7 @@ class OnnxNetwork:
             model, data_prop=True
         )  # for all parts at once: it takes most
         once, by_pass = split_graph(model, "camera", _ANSWERS)
+        self._learned = listed_weights(model) if WEIGHTS in self.metadata else {}
         threads = self._learn.threads
         self._once = None if once is None else _session(once, threads)
         self._network, self._evidence = _session(by_pass, threads), _evidence_session(model, threads)
@@ -167,9 +171,12 @@ class OnnxNetwork:
         return found
 
     def evidence(
-        self, sensors: FrameSensors, T_camera_lidar: Float[np.ndarray, "4 4"]
-    ) -> FrameEvidence | None:
-        """Matching evidence, points chosen at a guess; None if the file has no such output."""
+        self, pair: str, sensors: FrameSensors, T_camera_lidar: Float[np.ndarray, "4 4"]
+    ) -> Evidence | None:
+        """Matching evidence of a pair, lidar points chosen at a guess; None if the file does not have what it takes."""
+        if pair == "lidar_radar":
+            objects_m = object_points(sensors, T_camera_lidar, self.config.grid)
+            return RadarEvidence.of(sensors, objects_m, self._learned)
         if self._evidence is None:
             return None
         no_radar = np.eye(4)  # which has no part in it

@@ -1,4 +1,8 @@
-"""A vehicle-day by networks: iterate the guess on pilot frames, ask about all frames near it, average the answers."""
+"""A vehicle-day by networks: iterate the guess on pilot frames, then fit each pair to the evidence of all frames.
+
+Camera-radar is then the product of the fits. Networks without evidence, and those of camera-radar alone, are asked
+about all frames near the guess, and their answers are averaged.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +16,20 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
-from pipeline.learn.infer.aggregate import BIAS_SIGMA, Answers, day_estimate, mean_answer, twists_about
-from pipeline.learn.infer.class_evidence import FrameEvidence
-from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day, likelihood
+from pipeline.learn.infer.aggregate import (
+    BIAS_SIGMA,
+    OBSERVABLE,
+    Answers,
+    day_estimate,
+    mean_answer,
+    twists_about,
+)
+from pipeline.learn.infer.joint_day import Evidence, Expected, JointDay, fitted_day, likelihood
 from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
 from pipeline.objective.stamp_gaps import expected_dt_s, gaps_s
 from pipeline.rig.estimates import Check, PairEstimate, Prior, Solution
-from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
+from pipeline.rig.se3 import adjoint, compose_covariance, exp_se3, inverse, log_se3, rotation_angle_rad
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -42,6 +52,10 @@ _BY_ELEVATION = {
     "lidar_radar": np.array([1, 1, 0, 0, 0, 1], bool),
 }
 
+
+# Pairs that are fitted to all frames at once: the sensor whose stamps are compared with the sweep's, and 1 where it is
+# the parent, -1 where the child (time offsets are parent less child).
+_FITTED = {"camera_lidar": ("camera", 1.0), "lidar_radar": ("radar", -1.0)}
 
 # frames(indices) yields the frames of a day with these frame_index, in order.
 FrameSource = Callable[[Sequence[int]], Iterator[Frame]]
@@ -78,8 +92,8 @@ class FrameNetwork(Protocol):
         """Inputs of `answer` from a frame; raises SampleRejectedError if it shows too little."""
         ...
 
-    def evidence(self, sensors: Any, T_camera_lidar: np.ndarray) -> FrameEvidence | None:
-        """Matching evidence of camera and lidar, points chosen at a guess; None if the network returns none."""
+    def evidence(self, pair: str, sensors: Any, T_camera_lidar: np.ndarray) -> Evidence | None:
+        """Matching evidence of a pair, lidar points chosen at a guess; None if the network has none of any frame."""
         ...
 
     def answer(self, sensors: Any, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
@@ -103,19 +117,26 @@ def solve_by_networks(
         SolveError: too few frames can be shown to the networks.
     """
     rng = np.random.default_rng([seed, 7])
-    asked, found, rejected, together = _asked_day(
-        observations, prior, networks, frames, rng, progress, clock_sigma_s
-    )
+    asked, rejected = _asked_frames(observations, prior, networks, frames, progress)
+    centre, candidates = _pilot_centre(asked, rng)
+    together: dict[str, JointDay] = {}
+    for pair in _FITTED:
+        day = _fitted_together(asked, pair, candidates[pair], centre["camera_lidar"], clock_sigma_s)
+        if day is not None:
+            together[pair], centre[pair] = day, day.fit.T
+    is_product = asked.composed and len(together) == len(_FITTED)
+    found = {} if is_product else _ask_all(asked, centre, rng, progress)
 
     def estimate(pair: str, rows: np.ndarray | None = None) -> PairEstimate:
+        if pair in together:
+            return together[pair].estimate(rows)
+        if is_product:
+            return _product(estimate("camera_lidar"), estimate("lidar_radar"), prior)
         answers = found[pair]
         if rows is not None:
             kept = {name: getattr(answers, name)[rows] for name in ("guess", "answer", "variance", "block")}
             answers = replace(answers, **kept, frames=max(1, round(answers.frames * float(rows.mean()))))
-        of_answers = _estimate(pair, answers, asked, rng)
-        if pair != "camera_lidar" or together is None:
-            return of_answers
-        return replace(together.estimate(rows), diagnostics=of_answers.diagnostics)
+        return _estimate(pair, answers, asked, rng)
 
     estimates = {
         pair: replace(estimate(pair), frames_rejected=dict(rejected))
@@ -123,9 +144,13 @@ def solve_by_networks(
         else PairEstimate.at_prior(pair, prior)
         for pair in PAIRS
     }
-    failed = {pair: _halves_disagree(pair, found[pair].block, estimate) for pair in triggered}
-    if together is not None and "camera_lidar" in failed:
-        failed["camera_lidar"] += together.failed
+    failed: dict[str, list[Check]] = {}
+    for pair in _FITTED if is_product else triggered:
+        own = together[pair].failed if pair in together else []
+        failed[pair] = _halves_disagree(pair, asked.block, estimate) + own
+    if is_product:
+        failed["camera_radar"] = [check for pair in _FITTED for check in failed[pair]]
+        failed = {pair: failed[pair] for pair in triggered}
     if asked.composed or len(triggered) < len(PAIRS):
         # A loop that closes by construction is no evidence.
         return Solution(method, estimates, failed_checks=failed)
@@ -185,18 +210,18 @@ def _searched(
         p: exp_se3(np.median(twists_about(prior.of(p), T), axis=0)) @ prior.of(p) for p, T in stacked.items()
     }
     worth = dict.fromkeys(PAIRS, np.full(len(starts), 1 / len(starts)))
-    looks = [
-        look
-        for network, sensors in zip(asked.networks, asked.sensors[0], strict=True)
-        if "camera_lidar" in network.pairs
-        for T in ends["camera_lidar"]
-        if (look := network.evidence(sensors, T)) is not None
-    ]
-    if looks:
-        worth["camera_lidar"] = likelihood(looks, ends["camera_lidar"])
-        centre["camera_lidar"] = ends["camera_lidar"][int(worth["camera_lidar"].argmax())]
-    if looks and asked.composed:
-        worth["camera_radar"] = worth["camera_lidar"]
+    for network, sensors in zip(asked.networks, asked.sensors[0], strict=True):
+        for pair in (p for p in _FITTED if p in network.pairs):
+            # Camera-lidar is judged by points chosen at each of its ends, the radar by those where the camera is then.
+            places = ends[pair] if pair == "camera_lidar" else [centre["camera_lidar"]]
+            looks = [look for T in places if (look := network.evidence(pair, sensors, T)) is not None]
+            if looks:
+                worth[pair] = likelihood(looks, ends[pair])
+                centre[pair] = ends[pair][int(worth[pair].argmax())]
+    if asked.composed:  # each end of one pair may go with each of the other
+        first, second = stacked["camera_lidar"], stacked["lidar_radar"]
+        stacked["camera_radar"] = (first[:, None] @ second).reshape(-1, 4, 4)
+        worth["camera_radar"] = np.outer(worth["camera_lidar"], worth["lidar_radar"]).ravel()
         centre["camera_radar"] = centre["camera_lidar"] @ centre["lidar_radar"]
     return centre, stacked, worth
 
@@ -215,20 +240,22 @@ class _Asked:
         """Whether a network makes camera_radar of the other two pairs, so that the loop closes by construction."""
         return any(n.composed for n in self.networks)
 
+    @property
+    def block(self) -> Int[np.ndarray, " F"]:
+        """Block of the bootstrap of each frame."""
+        return _blocks([o.drive for o in self.observations])
+
     def unobservable(self, pair: str) -> Bool[np.ndarray, " 6"]:
         """Degrees of freedom that no frame of the day can determine."""
         measured = any(o.radar_has_elevation for o in self.observations)
         return np.zeros(6, bool) if measured else _BY_ELEVATION[pair]
 
 
-def _asked_day(
+def _asked_frames(
     observations: Mapping[str, Sequence[Observation]], prior: Prior, networks: Sequence[FrameNetwork],
-    frames: FrameSource, rng: np.random.Generator, progress: Progress, clock_sigma_s: float,
-) -> tuple[_Asked, dict[str, Answers], Counter[str], JointDay | None]:  # fmt: skip
-    """Prepare all frames, iterate the guess on pilot frames, fit camera-lidar to all frames, run all frames.
-
-    Also counts rejected frames by reason. The fit is None if no network returns its evidence.
-    """
+    frames: FrameSource, progress: Progress,
+) -> tuple[_Asked, Counter[str]]:  # fmt: skip
+    """Prepare all frames; also counts rejected frames by reason."""
     chosen = _chosen(observations)
     rejected: Counter[str] = Counter()
     asked = _Asked(networks, prior, [], [])
@@ -245,38 +272,51 @@ def _asked_day(
         raise SolveError(
             f"too few frames for a network: {len(asked.sensors)} of {total} ({why or 'short day'})"
         )
-    centre, candidates = _pilot_centre(asked, rng)
-    together = _fitted_together(asked, candidates, clock_sigma_s)
-    if together is not None:
-        centre["camera_lidar"] = together.fit.T
-    everything = range(len(asked.sensors))
-    found = _ask(asked, everything, centre, rng, lambda i: progress(total + i, 2 * total, "ask networks"))
-    return asked, found, rejected, together
+    return asked, rejected
 
 
 def _fitted_together(
-    asked: _Asked, candidates: Sequence[np.ndarray], clock_sigma_s: float
-) -> JointDay | None:
-    """Camera-lidar and the camera's clock by all frames at once, if a network returns its evidence."""
-    which = next((i for i, n in enumerate(asked.networks) if "camera_lidar" in n.pairs), None)
+    asked: _Asked, pair: str, candidates: Sequence[np.ndarray], T_camera_lidar: np.ndarray, clock_sigma_s: float
+) -> JointDay | None:  # fmt: skip
+    """A pair and its clock by all frames at once, if a network returns its evidence.
+
+    `T_camera_lidar` chooses the lidar's points for lidar-radar.
+    """
+    which = next((i for i, n in enumerate(asked.networks) if pair in n.pairs), None)
     if which is None:
         return None
 
-    gap_s, stated_s = gaps_s(asked.observations, "camera"), asked.prior.camera.stamp_sigma_s
+    sensor, sign = _FITTED[pair]
+    gap_s, stated_s = sign * gaps_s(asked.observations, sensor), None
+    travels = np.stack([_travel(o, asked.prior) for o in asked.observations])
+    if sensor == "camera":
+        stated_s = asked.prior.camera.stamp_sigma_s
+    else:  # the points are the radar's, whose own travel they show
+        travels = travels @ adjoint(inverse(asked.prior.T_lidar_radar)).T
     clock_s = expected_dt_s(gap_s, stated_s)
-    travels = [_travel(o, asked.prior) for o in asked.observations]
 
-    def evidence(T: np.ndarray) -> list[FrameEvidence]:
-        network = asked.networks[which]
-        found = (network.evidence(sensors[which], T) for sensors in asked.sensors)
+    def evidence(T: np.ndarray) -> list[Evidence]:
+        network, chosen_at = asked.networks[which], T if pair == "camera_lidar" else T_camera_lidar
+        found = (network.evidence(pair, sensors[which], chosen_at) for sensors in asked.sensors)
         moving = zip(found, travels, (gap_s - clock_s).tolist(), strict=True)
         return [replace(f, travel=travel, lag_s=lag_s) for f, travel, lag_s in moving if f is not None]
 
-    block, pair = _blocks([o.drive for o in asked.observations]), "camera_lidar"
     expected = Expected(
         asked.prior.of(pair), asked.prior.covariance(pair), stated_s or clock_sigma_s, clock_s
     )
-    return fitted_day(evidence, block, candidates, expected)
+    return fitted_day(pair, evidence, asked.block, candidates, expected)
+
+
+def _product(camera_lidar: PairEstimate, lidar_radar: PairEstimate, prior: Prior) -> PairEstimate:
+    """Camera-radar through the lidar."""
+    pair, parts, T = "camera_radar", (camera_lidar, lidar_radar), camera_lidar.T
+    covariance = compose_covariance(T, camera_lidar.covariance, lidar_radar.covariance)
+    common = [p.covariance if p.common_covariance is None else p.common_covariance for p in parts]
+    observability = np.clip(1 - np.diag(covariance) / np.diag(prior.covariance(pair)), 0.0, 1.0)
+    return PairEstimate(
+        pair, T @ lidar_radar.T, covariance, observability, observability >= OBSERVABLE,
+        min(p.frames_used for p in parts), common_covariance=compose_covariance(T, *common),
+    )  # fmt: skip
 
 
 def _travel(observation: Observation, prior: Prior) -> Float[np.ndarray, " 6"]:
@@ -293,26 +333,35 @@ def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observati
     return [ordered[i] for i in kept]
 
 
-def _pilot_centre(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
+def _pilot_centre(
+    asked: _Asked, rng: np.random.Generator
+) -> tuple[dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
     """Iterate the guess on pilot frames until it moves less than 0.3 deg: answers are best near the truth.
 
-    Also returns candidates for camera-lidar: the centre of each round and the answer of each pilot frame.
+    Also returns candidates for each pair: the centre of each round and the answer of each pilot frame.
     """
     count, prior = len(asked.sensors), asked.prior
     centre = {pair: prior.of(pair) for pair in PAIRS}
     rows: list[int] = np.unique(np.linspace(0, count - 1, min(count, _PILOT_FRAMES)).astype(int)).tolist()
     rows *= -(-_FEWEST_GUESSES // len(rows))
-    candidates = []
+    candidates: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
     for _ in range(_PILOT_ROUNDS):
         found = _ask(asked, rows, centre, rng, lambda _: None)
         moved = {p: mean_answer(found[p], prior.of(p), prior.covariance(p)) for p in PAIRS}
         turned_rad = max(float(rotation_angle_rad(moved[p] @ inverse(centre[p]))) for p in PAIRS)
-        own = found["camera_lidar"]
-        candidates += [moved["camera_lidar"], *(exp_se3(own.answer) @ own.T_centre)]
+        for pair, own in found.items():
+            candidates[pair] += [moved[pair], *(exp_se3(own.answer) @ own.T_centre)]
         centre = moved
         if turned_rad < _CONVERGED_RAD:
             break
     return centre, candidates
+
+
+def _ask_all(
+    asked: _Asked, centre: Mapping[str, np.ndarray], rng: np.random.Generator, progress: Progress
+) -> dict[str, Answers]:
+    total = len(asked.sensors)
+    return _ask(asked, range(total), centre, rng, lambda i: progress(total + i, 2 * total, "ask networks"))
 
 
 def _ask(

@@ -33,10 +33,11 @@ from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Heads, Predictions
 from pipeline.learn.network.views import NetworkInputs, RenderedView, render
 from pipeline.learn.sample.grid import CAMERA_CHANNELS, LIDAR_CHANNELS, PAIRS, RADAR_CHANNELS, NetworkConfig
+from pipeline.learn.sample.weights import Place, listed_weights
 from pipeline.objective.differentiable.projection import inverse, transform_points
 from schemas.training import GRID_CLASSES
 
-__all__ = ["WEIGHTS", "CalibrationNetwork", "ConcatCore", "build_network", "network_of_file", "weight_places"]
+__all__ = ["CalibrationNetwork", "ConcatCore", "build_network", "network_of_file", "weight_places"]
 
 _CHANNELS = {"camera": CAMERA_CHANNELS, "lidar": LIDAR_CHANNELS, "radar": RADAR_CHANNELS}
 _STD = 1e-2  # heads start near no correction
@@ -131,10 +132,6 @@ def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:
         return CalibrationNetwork(config)
 
 
-WEIGHTS = "weights"  # key of the metadata
-Place = Mapping[str, Any]
-
-
 def weight_places(state: Mapping[str, Tensor], model: onnx.ModelProto) -> dict[str, Place]:
     """Location of each weight in the graph: initializer and whether it is transposed; or its values."""
     lying: dict[bytes, Place] = {}
@@ -159,20 +156,16 @@ def network_of_file(path: Path) -> CalibrationNetwork:
     try:
         model = onnx.load(str(path))
         metadata = {entry.key: entry.value for entry in model.metadata_props}
-        places: dict[str, Place] = json.loads(metadata[WEIGHTS])
+        listed = listed_weights(model)
         config = NetworkConfig.of_json(metadata["network"])
     except Exception as err:  # protobuf has its own exceptions, different by version
         raise ModelError(str(path), "does not list its weights, so training cannot continue from it") from err
     if (classes := json.loads(metadata.get("classes", "[]"))) != list(GRID_CLASSES):
         problem = f"its classes are {', '.join(classes)}, those of table training {', '.join(GRID_CLASSES)}"
         raise ModelError(str(path), problem)
-    held = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
     network = CalibrationNetwork(config)
     state = network.state_dict()
-    for name, weight in state.items():
-        place = places[name]
-        found = np.array(place["values"], np.float32) if "values" in place else held[place["name"]]
-        state[name] = torch.tensor((found.T if place.get("turned") else found).reshape(tuple(weight.shape)))
+    state |= {name: torch.tensor(listed[name].reshape(tuple(w.shape))) for name, w in state.items()}
     network.load_state_dict(state)
     return network.eval()
 

@@ -35,7 +35,7 @@ from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = [
     "NEARNESS_M", "FrameSensors", "frame_sensors", "lidar_features", "mark_strength", "nearest_points",
-    "painted", "radar_features", "render_frame", "render_lidar",
+    "object_points", "painted", "radar_features", "render_frame", "render_lidar",
 ]  # fmt: skip
 
 _INTENSITY = LIDAR_FEATURES.index("intensity")
@@ -152,9 +152,8 @@ def render_lidar(
     lidar_camera = transform_points(T_camera_lidar, xyz_m).astype(np.float32)
     edge, ground = features[:, _EDGE], features[:, _GROUND]
     in_view = _in_view(lidar_camera, grid)
-    rank = _importance(len(lidar_camera))
+    rank, solid = _importance(len(lidar_camera)), _solid(lidar_camera, features, in_view)
     matched = _best(rank + _EDGE_BONUS * edge + _OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
-    solid = _best(rank, in_view & (ground < 0.5), OBJECT_POINTS)
     weight = np.where(ground > 0.5, np.float32(_GROUND_WEIGHT), np.float32(1))
     cells, index = painted(lidar_camera, features, grid, nearness)
     strength, marked = _marks(cells, index) if marks else (np.zeros(0, np.float32), index[:0])
@@ -167,6 +166,18 @@ def render_lidar(
         "marks_camera": padded_rows(lidar_camera[marked], MARKED_POINTS),
         "mark_weight": padded_rows(strength, MARKED_POINTS),
     }, index
+
+
+def object_points(
+    sensors: FrameSensors, T_camera_lidar: Float[np.ndarray, "4 4"], grid: Grid
+) -> Float32[np.ndarray, "L 3"]:
+    """The sweep's points off the ground in the camera's view, as a graph gets them [m]."""
+    lidar_camera = transform_points(T_camera_lidar, sensors.lidar_xyz_m).astype(np.float32)
+    return sensors.lidar_xyz_m[_solid(lidar_camera, sensors.lidar_features, _in_view(lidar_camera, grid))]
+
+
+def _solid(lidar_camera: np.ndarray, features: np.ndarray, in_view: np.ndarray) -> Int32[np.ndarray, " L"]:
+    return _best(_importance(len(lidar_camera)), in_view & (features[:, _GROUND] < 0.5), OBJECT_POINTS)
 
 
 def nearest_points(points_camera: Float[np.ndarray, "N 3"], grid: Grid) -> Int32[np.ndarray, " HW"]:

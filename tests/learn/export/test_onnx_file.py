@@ -88,7 +88,11 @@ def test_the_file_computes_what_the_network_computes_in_one_pass_and_in_three(ex
 def test_what_a_file_matches_by_is_what_the_network_matches_by(exported):
     network, _, opened = exported
     T_camera_lidar = guess()["camera_lidar"]
-    told = opened.evidence(frame_sensors(row(), GRID, classes()), T_camera_lidar)
+    sensors = frame_sensors(row(), GRID, classes())
+    told = opened.evidence("camera_lidar", sensors, T_camera_lidar)
+    if (scan := opened.evidence("lidar_radar", sensors, T_camera_lidar)) is not None:
+        assert scan.width == pytest.approx(network.core.radar_matcher.log_width.detach().exp().numpy())
+    assert (scan is None) == (not hasattr(network.core, "radar_matcher"))
     with torch.no_grad():
         view, _ = render(inputs(), GRID, classes=network.config.takes_classes)
         evidence = network.core(view).evidence

@@ -53,7 +53,7 @@ class Oracle:
         assert frame.frame_index == observation.frame_index
         return frame.frame_index
 
-    def evidence(self, _sensors, _T_camera_lidar):
+    def evidence(self, _pair, _sensors, _T_camera_lidar):
         return None
 
     def answer(self, _sensors, guess):
@@ -175,8 +175,8 @@ class Alike(Oracle):
 
     shown = None
 
-    def evidence(self, _sensors, _T_camera_lidar):
-        return self.shown
+    def evidence(self, pair, _sensors, _T_camera_lidar):
+        return self.shown if pair == "camera_lidar" else None
 
     def answer(self, sensors, guess):
         found = super().answer(sensors, guess)
@@ -218,7 +218,7 @@ def test_stated_stamps_are_believed_and_others_are_errors_of_the_clock_until_fra
     ways = [_travel(o, prior) for o in late]
     shown = [evidence_of(i, T_CAMERA_LIDAR @ exp_se3(-0.05 * way)) for i, way in enumerate(ways)]
     network = Oracle()
-    network.evidence = lambda i, _T: shown[i]
+    network.evidence = lambda pair, i, _T: shown[i] if pair == "camera_lidar" else None
     found = solve((late, frames[1]), [network], prior).pairs["camera_lidar"]
     assert found.time_offset_prior_s == pytest.approx(0.05 if stamp_sigma_s is None else 0.0)
     assert found.time_offset_s == pytest.approx(0.0, abs=0.006)
