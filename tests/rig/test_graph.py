@@ -49,24 +49,10 @@ def test_components_begin_with_the_references():
     assert names == [["top", "front"], ["side"], ["rear"], ["corner", "base"]]
 
 
-NAMES = ("front", "corner")
-
-
-@pytest.fixture
-def poses():
-    rng = np.random.default_rng(3)
-    T = {"top": np.eye(4)} | {n: exp_se3(rng.normal(0, 0.7, 6)) for n in NAMES}
+def test_the_common_part_of_a_covariance_is_carried_as_the_whole_is():
+    rng, names = np.random.default_rng(3), ("front", "corner")
+    T = {"top": np.eye(4)} | {n: exp_se3(rng.normal(0, 0.7, 6)) for n in names}
     root = rng.normal(0, 0.01, (12, 12))
-    return Extrinsics(Sensor("top", "lidar"), T, NAMES, root @ root.T, 0.25 * root @ root.T)
-
-
-def test_a_covariance_between_two_sensors_uses_what_they_share(poses):
-    J = poses.jacobian_between("front", "corner")
-    np.testing.assert_allclose(poses.covariance_between("front", "corner"), J @ poses.covariance @ J.T)
+    poses = Extrinsics(TOP, T, names, root @ root.T, 0.25 * root @ root.T)
     quarter = poses.covariance_between("front", "corner", common=True)
     np.testing.assert_allclose(quarter, 0.25 * poses.covariance_between("front", "corner"))
-
-
-def test_a_sensor_against_the_reference_has_its_own_rows(poses):
-    np.testing.assert_allclose(poses.covariance_between("top", "front"), poses.covariance[:6, :6])
-    np.testing.assert_array_equal(poses.between("top", "corner"), poses.T["corner"])
