@@ -53,7 +53,7 @@ REASONS = {
     "labels moved": "{reason}; the offset was removed{effect}",
     "focal length": "CameraInfo's focal length is contradicted by the day: measured {off:+.1%} +- {sigma:.1%}",
     "principal point": "CameraInfo's principal point is contradicted by the day: measured {right} px right, {down} px "
-    "down: right in the image, not in the mounting",
+    "down: the pose is turned by so much",
     # Sources of the car's motion, and axes.
     "speed": "{source} agrees with {other} in {share:.0%} of the moving frames, and shows {ratio:+.2f} times the "
     "speed: {hint}",

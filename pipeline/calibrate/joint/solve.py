@@ -4,7 +4,7 @@ No evidence enters two pairs: vehicle boxes belong to camera-radar alone. One nu
 camera-lidar's time offset moves the cloud along the driving direction, which in lidar axes comes from the
 radar's Doppler (`objective/ego_motion`), with the uncertainty of the radar's rotation. If a sensor is
 missing, the other pairs are solved as they are: camera-lidar along the lidar's own x axis. A CameraInfo that
-the day contradicts holds camera-lidar, because its pose depends on it.
+the day contradicts holds camera-lidar, because its pose depends on it; a principal point, camera-radar too.
 
 Camera-radar, without the lidar, is solved here: moving clusters against boxes in azimuth, detections in boxes in
 elevation. The translation stays at the prior (angles of far objects hardly depend on it). The azimuth has a sigma of a
@@ -107,7 +107,9 @@ def _solved(
     if pair == "lidar_radar":
         return estimate_lidar_radar(observations, prior, config, rng), []
     if pair == "camera_radar":
-        return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), []
+        lidar = before.get("camera_lidar", (None, []))[1]
+        turned = [check for check in lidar if check.fault == "camera_info" and check.error is not None]
+        return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), turned
     aligned = align_camera_lidar(observations, prior, config, rng)
     heading_rad = _heading_rad(observations, before.get("lidar_radar"), prior)
     found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading_rad=heading_rad)
@@ -225,21 +227,15 @@ def estimate_camera_radar(
         "moving_clusters": float(seen.clusters.count),
         "rival_share": rival,
     }
+    common = common_of(after.covariance, prior_covariance, np.diag(CAMERA_RADAR_BIAS**2))
     return PairEstimate(
-        "camera_radar",
-        T,
-        J @ after.covariance @ J.T,
-        after.observability,
-        after.observable,
-        frames,
+        "camera_radar", T, J @ after.covariance @ J.T, after.observability, after.observable, frames,
         {"no moving cluster": len(observations) - frames},
         diagnostics={k: v for k, v in diagnostics.items() if np.isfinite(v)},
         notes=notes,
-        common_covariance=J
-        @ common_of(after.covariance, prior_covariance, np.diag(CAMERA_RADAR_BIAS**2))
-        @ J.T,
+        common_covariance=J @ common @ J.T,
         **estimate_biases([Considered("boxes", np.diag(CAMERA_RADAR_BIAS * after.observable))], J),
-    )
+    )  # fmt: skip
 
 
 def _with_open_azimuth(after: Posterior, prior_covariance: np.ndarray) -> Posterior:
@@ -248,12 +244,8 @@ def _with_open_azimuth(after: Posterior, prior_covariance: np.ndarray) -> Poster
     covariance[_YAW, :] = covariance[:, _YAW] = 0.0
     covariance[_YAW, _YAW] = prior_covariance[_YAW, _YAW]
     observability[_YAW] = 0.0
-    return replace(
-        after,
-        covariance=covariance,
-        observability=observability,
-        observable=after.observable & (np.arange(6) != _YAW),
-    )
+    observable = after.observable & (np.arange(6) != _YAW)
+    return replace(after, covariance=covariance, observability=observability, observable=observable)
 
 
 def _solve_camera_radar(

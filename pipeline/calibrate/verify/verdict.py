@@ -135,9 +135,7 @@ def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
     said = [_harmless(check, result, claims) for check in checks]
     reason = "; ".join([*said, *_reservations(result, claims)])
     faults = tuple(faults_of(checks))
-    # A wrong principal point is right in the image: what nobody knows then is where the camera is mounted.
-    is_mounted = "camera_info" not in faults
-    mounting = tuple(name for name in certified if is_mounted and claims[name].certifies_mounting)
+    mounting = tuple(name for name in certified if claims[name].certifies_mounting)
     return Verdict("accepted", reason, score, certified, mounting=mounting, faults=faults)
 
 

@@ -128,7 +128,7 @@ def align_camera_lidar(
     width_px = label_width_px(sharp, state.alone, kernel)
     sharp, seed = widened(sharp, state.T_camera_lidar, width_px), int(rng.integers(2**32))
     problem = CameraLidarProblem(sharp, prior, config, scenes, seed, prior.translation_sigma_m**2)
-    intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
+    intrinsics = measure_intrinsics(problem, state, kernel, frames, rng)
     dt_s = expected_dt_s(gaps_s(frames, "camera"), stated_s)
     return Aligned(problem, frames, rejected, basin, state, kernel, dt_s, intrinsics, width_px)
 

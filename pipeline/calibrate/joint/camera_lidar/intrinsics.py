@@ -12,13 +12,14 @@ select the better end. From the first start alone, a highway whose camera was 60
 
 Edges alone determine the focal length, with the principal point held. Markings run along the direction of
 travel, where motion and focal length have the same effect: with them it was 0.8 % off, by edges 0.5 % off.
-The principal point needs markings, because they reach the image's lower corners.
+The principal point has two sources, weighed by their information. Edges and markings (which reach the image's lower
+corners) show that of pinholes. Of a fisheye, a shift is a turn but for some pixels in the corners, where the lidar may
+not look; but static points move along epipolar lines, which no turn moves, so tracks between two images of the camera
+show it. A fisheye of 116 deg: edges know it to 30 px, tracks to 8; a pinhole of 84 deg: to 4 and 30.
 
 A contradiction of CameraInfo must pass two more tests before it holds a record. The first and the second half
-of the frames must each show it separately. If a smaller weight of the markings moves the principal point, its
-sigma is at least this change. Before, five of 64 days with a right CameraInfo were contradicted: highways
-whose halves ended at different ends of the valley, and dusk, when markings alone moved the principal point up
-by 40 px.
+of the frames must each show it separately (highways end at different ends of the valley). If a smaller weight of the
+markings moves the principal point, its sigma is at least this change (at dusk markings alone moved it up by 40 px).
 
 Source: Triggs et al. 2000, section 4 (Gauss-Newton with robust weights); the sigmas are measured, see their
 constants.
@@ -26,6 +27,7 @@ constants.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,14 +39,19 @@ from pipeline.calibrate.numerics.nuisances import (
     DAY_CENTRE_SIGMAS,
     DAY_FOCAL_FLOOR,
     DAY_FOCAL_SIGMAS,
+    DAY_TRACKS_SIGMAS,
     INTRINSICS_CONTRADICTION_SIGMAS,
     INTRINSICS_HALF_SIGMAS,
 )
 from pipeline.calibrate.reasons import because
 from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.epipolar import Seen, off_lines_px, seen
 from pipeline.rig.estimates import Check, Prior
 from pipeline.rig.se3 import change_between, change_jacobian
+from schemas.image_motion import tracking_scale
+from schemas.observations import Observation
 
 __all__ = ["DayIntrinsics", "contradictions", "measure_intrinsics"]
 
@@ -59,9 +66,10 @@ _FOCAL_REACH, _CENTRE_REACH = 0.05, 0.13
 _HELD_PX = 1e-3  # sigma of a principal point that stays
 _LESS_MARKING = 0.25  # of their weight: enough to let edges decide where they are informative
 _DECIDED_SIGMAS = 3.0  # of the frames' scatter: where two ends score alike, half of their distance is sigma
-# A turn by d/f stands in for a principal point d off on the axis, and leaves sin^2 of the angle to it: here, of targets
-# 16 deg to the side. Measured on a day of f = 600 px with 20 px (1.9 deg): .10 at 15 deg, .06 to .08 of 20 px down.
-_LEFT_OF_TURN = 0.076
+# A pair with fewer tracks is left out. Those that scatter by more pixels at the size of tracking are of mirrors and
+# fences, whose errors are no noise: an alley moved the point by 50 px at 7 (another simulator's by 11 at 4: the floor).
+_FLOOR_PX, _TRACKS, _MOST_TRACKS, _TRACK_NOISE_PX, _LEAST_NOISE_PX = 3.0, 40, 300, 0.2, 0.05
+_PASSES, _LONGER, _STEP, _HELD = 4, 1.5, 1e-5, 1e-9  # steps under a Cauchy loss end short
 _FOCAL, _CENTRE, _UNKNOWNS = 7, slice(8, 10), 10
 
 
@@ -83,17 +91,15 @@ class DayIntrinsics:
 
     def diagnostics(self, known: CameraPrior) -> dict[str, float]:
         """Numbers of the record; `mounting_*` is the camera's rotation sigma due to the principal point."""
+        sigmas = tuple(zip("uv", self.centre_sigma_px.tolist(), strict=True))
         yaw_rad, pitch_rad = self._turn_sigma_rad(known)
         return {
             "day_focal_scale": self.focal,
             "day_focal_sigma": self.focal_sigma,
             "day_focal_observable": float(self.focal_sigma <= known.focal_sigma),
             **{f"day_centre_{n}_px": float(v) for n, v in zip("uv", self.centre_px, strict=True)},
-            **{f"day_centre_{n}_sigma_px": float(v) for n, v in zip("uv", self.centre_sigma_px, strict=True)},
-            **{
-                f"day_centre_{n}_observable": float(v <= known.centre_sigma_px)
-                for n, v in zip("uv", self.centre_sigma_px, strict=True)
-            },
+            **{f"day_centre_{n}_sigma_px": v for n, v in sigmas},
+            **{f"day_centre_{n}_observable": float(v <= known.centre_sigma_px) for n, v in sigmas},
             "mounting_yaw_sigma_rad": yaw_rad,
             "mounting_pitch_sigma_rad": pitch_rad,
         }
@@ -102,22 +108,24 @@ class DayIntrinsics:
         """Text of the assumption, and the smallest error of it that the day would have detected."""
         yaw, pitch = np.degrees(self._turn_sigma_rad(known))
         source = because("centre stated" if known.centre_is_stated else "centre by day")
-        right, down = (
-            f"{px:+.0f} +- {sigma:.0f}"
-            for px, sigma in zip(self.centre_px, self.centre_sigma_px, strict=True)
-        )
         scale = {"focal": self.focal - 1, "sigma": self.focal_sigma}
         return [
             because("in the image", yaw=yaw, pitch=pitch, source=source),
-            because("off CameraInfo", **scale, right=right, down=down),
-            # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
+            because("off CameraInfo", **scale, **self.centre_text(0)),
             because("readout", ms=1e3 * known.readout_s),
         ]
 
+    def centre_text(self, digits: int) -> dict[str, str]:
+        """The principal point in words."""
+        both = zip(("right", "down"), self.centre_px, self.centre_sigma_px, strict=True)
+        return {name: f"{px:+.{digits}f} +- {sigma:.{digits}f}" for name, px, sigma in both}
+
     def _turn_sigma_rad(self, known: CameraPrior) -> tuple[float, float]:
         """Sigma of the camera's yaw and pitch, if the principal point is known; a default value does not count."""
-        stated_px = known.centre_sigma_px if known.centre_is_stated else np.inf
-        yaw, pitch = _together(self.centre_sigma_px, stated_px) / np.array(self.focal_px)
+        sigma_px = self.centre_sigma_px
+        if known.centre_is_stated:
+            sigma_px = sigma_px * known.centre_sigma_px / np.hypot(sigma_px, known.centre_sigma_px)
+        yaw, pitch = sigma_px / np.array(self.focal_px)
         return float(yaw), float(pitch)
 
 
@@ -129,63 +137,46 @@ def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[Check]:
         is_wrong &= np.sign(off) * _off_by_sigmas(half, known) > INTRINSICS_HALF_SIGMAS
     found = []
     if is_wrong[0]:
-        why = because("focal length", off=day.focal - 1, sigma=day.focal_sigma)
-        found.append(Check(why, "camera_info"))
+        found.append(Check(because("focal length", off=day.focal - 1, sigma=day.focal_sigma), "camera_info"))
     if is_wrong[1:].any():
-        right, down = (
-            f"{px:+.1f} +- {sigma:.1f}" for px, sigma in zip(day.centre_px, day.centre_sigma_px, strict=True)
-        )
-        left_rad = [
-            float(abs(d) / f * _LEFT_OF_TURN) for d, f in zip(day.centre_px, day.focal_px, strict=True)
-        ]
-        found.append(
-            Check(
-                because("principal point", right=right, down=down),
-                "camera_info",
-                error=(left_rad[1], left_rad[0], 0.0, 0.0, 0.0, 0.0),
-            )
-        )
+        yaw, pitch = (np.abs(day.centre_px) / day.focal_px).tolist()  # the pose is turned by so much
+        why = because("principal point", **day.centre_text(1))
+        found.append(Check(why, "camera_info", error=(pitch, yaw, 0.0, 0.0, 0.0, 0.0)))
     return found
 
 
 def measure_intrinsics(
-    problem: CameraLidarProblem,
-    state: AlignmentState,
-    kernel: KernelSettings,
-    label_scale: float,
+    problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, frames: Sequence[Observation],
     rng: np.random.Generator,
-) -> DayIntrinsics:
+) -> DayIntrinsics:  # fmt: skip
     """Solve for pose, time offset, focal length and principal point together, from an aligned pose.
 
     Args:
         kernel: kernel with the weights of edges and markings.
-        label_scale: label pixels per image pixel.
+        frames: those of the problem.
     """
-    day = _measured(problem, state, kernel, label_scale, rng)
+    day = _measured(problem, state, kernel, frames, rng)
     if not contradictions(day, problem.prior.camera):
         return day
     edges_decide = replace(kernel, marking_weight=_LESS_MARKING * kernel.marking_weight)
-    moved = _measured(problem, state, edges_decide, label_scale, rng).centre_px - day.centre_px
+    moved = _measured(problem, state, edges_decide, frames, rng).centre_px - day.centre_px
     # By time: neighbouring frames see the same scene, and share what it does to the valley.
-    by_time = np.array_split(np.arange(problem.terms.frames), 2)
-    halves = tuple(
-        _measured(replace(problem, terms=problem.terms.of_frames(f)), state, kernel, label_scale, rng)
-        for f in by_time
-    )
+    by_time = np.array_split(np.arange(len(frames)), 2)
+    parts = [(replace(problem, terms=problem.terms.of_frames(f)), [frames[k] for k in f]) for f in by_time]
+    halves = tuple(_measured(part, state, kernel, own, rng) for part, own in parts)
     return replace(day, centre_sigma_px=np.hypot(day.centre_sigma_px, moved), halves=halves)
 
 
 def _measured(
-    problem: CameraLidarProblem,
-    state: AlignmentState,
-    kernel: KernelSettings,
-    label_scale: float,
+    problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, frames: Sequence[Observation],
     rng: np.random.Generator,
-) -> DayIntrinsics:
+) -> DayIntrinsics:  # fmt: skip
     """The measurement from the problem's frames; arguments as of `measure_intrinsics`."""
     some = replace(problem, terms=problem.terms.at_most(_POINTS, rng))
+    only_edges = replace(kernel, marking_weight=0.0)
     expected, aligned = (
-        _focal_end(some, start, kernel, rng) for start in (AlignmentState(state.T_camera_lidar), state)
+        _solved(some, _State(start, np.zeros(2)), only_edges, _HELD_PX, rng)
+        for start in (AlignmentState(state.T_camera_lidar), state)
     )
     lead, is_decided = _lead(some, aligned, expected)
     best, other = (aligned, expected) if lead > 0 else (expected, aligned)
@@ -195,16 +186,63 @@ def _measured(
     # From the aligned pose again: the edges of 16 rings do not determine pitch.
     begin = _State(AlignmentState(state.T_camera_lidar, dt_s, focal), np.zeros(2))
     end = _solved(some, begin, kernel, reach_px, rng)
-    centre_sigma = DAY_CENTRE_SIGMAS * np.sqrt(np.diag(np.linalg.inv(end.information))[_CENTRE])
+    scale, (fx, fy) = frames[0].label_scale, problem.terms.maps.camera.focal_px
+    by_edges = np.linalg.inv(np.linalg.inv(end.information)[_CENTRE, _CENTRE])
+    by_edges *= (scale / DAY_CENTRE_SIGMAS) ** 2
+    shown_px, by_tracks = _by_tracks(frames, problem.prior.camera.readout_s, reach_px / scale)
+    covariance = np.linalg.inv(by_edges + by_tracks)
     formal = float(np.linalg.inv(best.information)[_FOCAL, _FOCAL])
-    fx, fy = problem.terms.maps.camera.focal_px
     return DayIntrinsics(
         focal,
         float(np.sqrt(DAY_FOCAL_SIGMAS**2 * formal + DAY_FOCAL_FLOOR**2 + apart**2 / 4)),
-        end.at.centre_px / label_scale,
-        centre_sigma / label_scale,
-        (fx / label_scale, fy / label_scale),
+        covariance @ (by_edges @ end.at.centre_px / scale + by_tracks @ shown_px),
+        np.sqrt(np.diag(covariance)),
+        (fx / scale, fy / scale),
     )
+
+
+def _by_tracks(
+    frames: Sequence[Observation], readout_s: float, reach_px: float
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "2 2"]]:
+    """Principal point minus CameraInfo's [px] by tracks, each pair of images with its own motion; its information."""
+    shown = [o for o in frames if o.motion_tracks_px is not None and len(o.motion_tracks_px) >= _TRACKS]
+    motions = [np.concatenate([o.motion_turn_rad, o.motion_direction]) for o in shown]
+    weak, centre, known = np.eye(2) / reach_px**2, np.zeros(2), []
+    for _ in range(_PASSES):
+        information, gradient = weak.copy(), -weak @ centre
+        for k, o in enumerate(shown):
+            views = _views(o, centre, readout_s)
+            for _ in range(2):  # first the motion alone: steps of both wander off along what no track shows
+                r = off_lines_px(*views[0], motions[k])
+                ends = [off_lines_px(*views[0], motions[k] + s) for s in _STEP * np.eye(6)]
+                J = (np.stack(ends, 1) - r[:, None]) / _STEP
+                noise_px = max(1.4826 * float(np.median(np.abs(r))), _LEAST_NOISE_PX)
+                sigma_px = noise_px * max(1.0, noise_px * tracking_scale(o.image_width_px) / _TRACK_NOISE_PX)
+                weight = 1 / (1 + (r / (2 * noise_px)) ** 2) / sigma_px**2
+                H = (J.T * weight) @ J
+                by = np.linalg.solve(H + _HELD * np.trace(H) * np.eye(6), J.T * weight)
+                motions[k] = motions[k] - by @ r
+            right, left, down, up = (off_lines_px(*view, motions[k]) for view in views[1:])
+            J_centre = np.stack([right - left, down - up], 1) / 2
+            J_centre -= J @ (by @ J_centre)
+            information += (J_centre.T * weight) @ J_centre
+            gradient -= (J_centre.T * weight) @ r
+        centre = centre + _LONGER * np.linalg.solve(information, gradient)
+        known.append((information - weak) / DAY_TRACKS_SIGMAS**2)
+    # Where tracks hardly show the point, it drifts to where their information seems larger.
+    H = min(known, key=np.linalg.det)
+    return centre, H @ np.linalg.inv(np.eye(2) + _FLOOR_PX**2 * H)
+
+
+def _views(o: Observation, centre: Float[np.ndarray, " 2"], readout_s: float) -> list[tuple[Seen, Seen]]:
+    """Tracks of a pair of images, by `seen`: as if all rows were exposed with the middle one."""
+    assert o.motion_tracks_px is not None
+    camera = replace(camera_of(o), K=o.camera_K + np.outer(np.append(centre, 0.0), [0.0, 0.0, 1.0]))
+    turn = readout_s / (o.motion_span_s or np.inf) * np.array(o.motion_turn_rad)
+    fewer = slice(None, None, 1 + len(o.motion_tracks_px) // _MOST_TRACKS)
+    both = np.split(o.motion_tracks_px[fewer].astype(np.float64), 2, axis=1)
+    late = [((uv[:, 1:] + 0.5) / o.image_height_px - 0.5) * turn for uv in both]
+    return list(zip(*(seen(camera, uv, by) for uv, by in zip(both, late, strict=True)), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,14 +278,6 @@ class _End:
     kernel: KernelSettings
 
 
-def _focal_end(
-    problem: CameraLidarProblem, start: AlignmentState, weights: KernelSettings, rng: np.random.Generator
-) -> _End:
-    """The end by edges alone, with the principal point fixed."""
-    only_edges = replace(weights, marking_weight=0.0)
-    return _solved(problem, _State(start, np.zeros(2)), only_edges, _HELD_PX, rng)
-
-
 def _lead(problem: CameraLidarProblem, end: _End, other: _End) -> tuple[float, bool]:
     """Lead of the edges' score at one end over another, and whether it is significant over frames."""
     apart = np.zeros(problem.terms.frames)
@@ -261,28 +291,19 @@ def _lead(problem: CameraLidarProblem, end: _End, other: _End) -> tuple[float, b
 
 
 def _solved(
-    problem: CameraLidarProblem,
-    at: _State,
-    weights: KernelSettings,
-    centre_sigma_px: float,
+    problem: CameraLidarProblem, at: _State, weights: KernelSettings, centre_sigma_px: float,
     rng: np.random.Generator,
-) -> _End:
+) -> _End:  # fmt: skip
     """Gauss-Newton steps at each kernel."""
     terms, prior = problem.terms, problem.prior
-    sigma = np.array(
-        [prior.rotation_sigma_rad] * 3
-        + [prior.translation_sigma_m] * 3
-        + [problem.config.time_offset_sigma_s, _FOCAL_REACH]
-        + [centre_sigma_px] * 2
-    )
+    of_pose = [*[prior.rotation_sigma_rad] * 3, *[prior.translation_sigma_m] * 3]
+    sigma = np.array([*of_pose, problem.config.time_offset_sigma_s, _FOCAL_REACH, *[centre_sigma_px] * 2])
     for sigma_px, contrast in _KERNELS:
         fitted = at.seen(terms).fitted(at.alignment.alone, KernelSettings.wide(sigma_px, contrast), rng)
         kernel = replace(
-            fitted,
-            edge_weight=weights.edge_weight,
-            marking_weight=weights.marking_weight,
+            fitted, edge_weight=weights.edge_weight, marking_weight=weights.marking_weight,
             wide_share=weights.wide_share,
-        )
+        )  # fmt: skip
         for _ in range(_STEPS):
             gradient, information = _equations(terms, at, kernel)
             information = information + np.diag(1 / sigma**2)
@@ -313,8 +334,3 @@ def _off_by_sigmas(day: DayIntrinsics, known: CameraPrior) -> Float[np.ndarray, 
     off = np.concatenate([[day.focal - 1], day.centre_px])
     sigma = np.concatenate([[day.focal_sigma], day.centre_sigma_px])
     return off / np.hypot(sigma, [known.focal_sigma, known.centre_sigma_px, known.centre_sigma_px])
-
-
-def _together(day_px: Float[np.ndarray, " 2"], stated_px: float) -> Float[np.ndarray, " 2"]:
-    """Sigma of the principal point from the stated value (infinite: none) and the day together."""
-    return day_px / np.hypot(1.0, day_px / stated_px) if stated_px else np.zeros(2)
