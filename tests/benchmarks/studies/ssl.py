@@ -45,7 +45,7 @@ SHIPPED = Path("pipeline/learn/models/joint_classes.onnx")
 STEPS, DRAWS, OFF, FIRST_DAY, PAIRWISE = 240, 4, (2.0, 0.2), "2026-03-02", "pairwise from nothing"
 FRAMES, ABRUPT_DEG = 16, 10.0
 SPLITS = (("00", "01", "02", "03"), ("03", "02", "01", "00"))  # the last one is the test
-SEED, TAUGHT, TESTED = 7501, 6, 4  # of the drawn rig and world: fresh for each release
+SEED, TAUGHT, TESTED = 7511, 6, 4  # of the drawn rig and world: fresh for each release
 # Recipe, what it changes, and whether it begins with the shipped network; of `pairwise` each pair has one of its own.
 NETWORKS: dict[str, tuple[str, str, bool]] = {
     "trained": ("rigs_real.toml", "", True),
@@ -91,7 +91,7 @@ def main() -> None:
     lines = [r for r in known if is_accepted(r["commit"], commit_now(), ())]
     for part in parts:
         for name in ["joint", *args.networks]:
-            row, of_frames = f"{part.name}: {name}", name not in ("joint", PAIRWISE)
+            row, of_frames = f"{part.name}: {name}", name in ("untrained", "trained")
             if not any(r["row"] == row for r in lines):
                 cost = {} if name in ("joint", "untrained") else _trained(part, name)
                 found = [{"row": row, "commit": commit_now()} | cost | r for r in _tested(part, name)]
