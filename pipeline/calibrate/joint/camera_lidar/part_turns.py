@@ -50,7 +50,7 @@ _PAINT_FLOOR_PX = 0.5  # on 34 good days of thirteen rigs paint is off by up to 
 # the objects' feet, yaw -.25 to +.02; the real car -.10 and .00, KITTI -.17 and .02.
 _BOX_PITCH_RAD, _FEWEST_BOXES = float(np.radians(-0.18)), 20
 # Beside its scatter, pitch by boxes errs by .05 deg on 51 days of eight rigs and by .10 on 34 of drawn worlds and rigs
-# (`boxes_pitch_*` and errors of the lines in tests/benchmarks/results).
+# (`boxes_pitch_*` and errors of the lines in tests/benchmarks/results of 62eb5928).
 _BOX_FLOOR_RAD: Final = tuple(np.radians((0.10, 0.15)).tolist())
 # Those that see a turn about an axis (0 pitch, 1 yaw); a turn along an edge moves it within its border.
 _SIDES: Final = {
