@@ -12,7 +12,7 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from pipeline.learn.sample.clouds import padded_rows
 from pipeline.learn.sample.grid import (
@@ -176,7 +176,7 @@ def object_points(
     return sensors.lidar_xyz_m[_solid(lidar_camera, sensors.lidar_features, _in_view(lidar_camera, grid))]
 
 
-def _solid(lidar_camera: np.ndarray, features: np.ndarray, in_view: np.ndarray) -> Int32[np.ndarray, " L"]:
+def _solid(lidar_camera: np.ndarray, features: np.ndarray, in_view: np.ndarray) -> Int64[np.ndarray, " L"]:
     return _best(_importance(len(lidar_camera)), in_view & (features[:, _GROUND] < 0.5), OBJECT_POINTS)
 
 

@@ -106,7 +106,8 @@ def radar_frame(seed, T=T_LIDAR_RADAR, has_elevation=True, late_s=0.0):
     clutter = rng.uniform([5, -20, -2], [60, 20, 2], (40, 3))
     detections = np.concatenate([from_spherical(to_spherical(seen) + errors), clutter]).astype(np.float32)
     no, features = np.zeros((0, 4), np.float32), np.zeros((160, 3), np.float32)
-    sensors = FrameSensors(no, no[:, :3], no, detections, features, has_elevation)
+    image = np.zeros((4, 1, 1), np.float32)
+    sensors = FrameSensors(image, no[:, :3], no, detections, features, has_elevation)
     found = RadarEvidence.of(sensors, objects.astype(np.float32), LEARNED)
     return replace(found, travel=adjoint(inverse(T)) @ travel)
 
