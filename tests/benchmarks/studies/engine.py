@@ -211,12 +211,18 @@ def _line(result: dict[str, Any]) -> str:
     )
 
 
-def boresight(*words: object) -> Any:
-    """Run the command; raises where it fails. Returns what the process and those that it started used."""
+def boresight(*words: object) -> tuple[float, float]:
+    """Run the command; raises where it fails. CPU seconds with all that it started, and its own peak memory [MB].
+
+    The memory is read while it runs: what the system reports of a process that ended is at least its parent's.
+    """
     process = subprocess.Popen([sys.executable, "-m", "jobs.cli", *map(str, words)], stdout=sys.stderr)
-    _, status, used = os.wait4(process.pid, 0)
-    if os.waitstatus_to_exitcode(status) not in (0, 3):
-        raise RuntimeError(
-            f"boresight {' '.join(map(str, words))}: exit code {os.waitstatus_to_exitcode(status)}"
-        )
-    return used
+    status, peak_kb = Path(f"/proc/{process.pid}/status"), 0
+    while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+        known = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        peak_kb = max(peak_kb, int(known.get("VmHWM", "0 kB").split()[0]))
+        time.sleep(0.1)
+    code, used = os.waitstatus_to_exitcode(ended[1]), ended[2]
+    if code not in (0, 3):
+        raise RuntimeError(f"boresight {' '.join(map(str, words))}: exit code {code}")
+    return used.ru_utime + used.ru_stime, peak_kb / 1e3

@@ -168,10 +168,8 @@ def _aged(fleet: Fleet, folder: Path) -> dict[str, Any]:
             for row in rows
         ]
         merge_rows(Lake.at(old), schema, with_months(to_table(earlier, schema), schema))
-    cpu_s = []
-    for lake in (folder / "lake", old):
-        used = boresight("audit", "--fleet", folder / "fleet.toml", "--lake", lake)
-        cpu_s.append(round(used.ru_utime + used.ru_stime, 1))
+    audit = ("audit", "--fleet", folder / "fleet.toml", "--lake")
+    cpu_s = [round(boresight(*audit, lake)[0], 1) for lake in (folder / "lake", old)]
     return {"day": {"seed": fleet.seed}, "commit": commit_now(), "cpu_s": cpu_s}
 
 

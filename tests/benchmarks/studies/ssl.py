@@ -157,8 +157,8 @@ def _trained(part: Part, name: str) -> dict[str, float]:
         what = ("--data", folder, "--out", run, "--config", config, "--steps", STEPS, "--pairs", pairs)
         used.append(boresight("train", *what, *begin))
         boresight("export", "onnx", "--run", run, "--out", model)
-    seconds = sum(u.ru_utime + u.ru_stime for u in used)
-    return {"steps": STEPS, "cpu_s_a_step": seconds / STEPS, "peak_mb": max(u.ru_maxrss for u in used) / 1e3}
+    cpu_s, peak_mb = zip(*used, strict=True)
+    return {"steps": STEPS, "cpu_s_a_step": sum(cpu_s) / STEPS, "peak_mb": max(peak_mb)}
 
 
 def _models(part: Part, name: str) -> dict[str, Path]:
