@@ -17,7 +17,8 @@ from pipeline.core.results import Progress
 from pipeline.core.stage_work import Task
 from pipeline.learn.infer.onnx_networks import OnnxNetwork, model_files, models_key, open_networks
 from pipeline.learn.infer.pitch_by_travel import informed_by_way
-from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
+from pipeline.learn.infer.single_frame import single_frame_solution
+from pipeline.learn.infer.vehicle_day import solve_by_networks
 from pipeline.rig.estimates import Check, Prior, Solution
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_columns
@@ -142,8 +143,7 @@ def _polished(
     finished = solve_joint(observations, start, config, seed=seed, triggered=triggered, progress=progress)
     pairs = {}
     for pair in PAIRS:
-        estimate = finished.pairs[pair]
-        said = solution.pairs[pair].diagnostics
+        estimate, said = finished.pairs[pair], solution.pairs[pair].diagnostics
         notes = [*estimate.notes, because("polished", method=solution.method)]
         pairs[pair] = replace(estimate, diagnostics={**said, **estimate.diagnostics}, notes=notes)
     return replace(finished, pairs=pairs)

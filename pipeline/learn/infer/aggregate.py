@@ -93,13 +93,9 @@ def twists_about(
 
 
 def day_estimate(
-    pair: str,
-    answers: Answers,
-    T_prior: Float[np.ndarray, "4 4"],
-    prior_covariance: Float[np.ndarray, "6 6"],
-    rng: np.random.Generator,
-    unobservable: Bool[np.ndarray, " 6"] | None = None,
-) -> PairEstimate:
+    pair: str, answers: Answers, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"],
+    rng: np.random.Generator, unobservable: Bool[np.ndarray, " 6"] | None = None,
+) -> PairEstimate:  # fmt: skip
     """Transform and covariance of a pair from the prior and all answers.
 
     Args:

@@ -85,11 +85,9 @@ class JointDay:
             fit.frames,
         )  # fmt: skip
         sigma_s = float(np.sqrt(np.linalg.inv(fit.information + expected.precision)[6, 6]))
+        clock_s = expected.clock_s
         return replace(
-            found,
-            time_offset_s=expected.clock_s + fit.dt_s,
-            time_offset_sigma_s=sigma_s,
-            time_offset_prior_s=expected.clock_s,
+            found, time_offset_s=clock_s + fit.dt_s, time_offset_sigma_s=sigma_s, time_offset_prior_s=clock_s
         )
 
 
@@ -200,11 +198,9 @@ def _fitting(
 
 
 def climbed(
-    frames: Sequence[Evidence],
-    start: _Place,
-    expected: Expected,
+    frames: Sequence[Evidence], start: _Place, expected: Expected,
     worth: float | Float[np.ndarray, " E"] = _FIRST_WORTH,
-) -> _Place:
+) -> _Place:  # fmt: skip
     """Peak above a start, of frames and prior together; `worth` weights each kind of evidence."""
     precision = expected.precision
 
@@ -241,9 +237,7 @@ def fit_of(
     return JointFit(*at, _positive_part(np.einsum("e,eij->ij", worth, H)), len(frames))
 
 
-def rival_score(
-    frames: Sequence[Evidence], block: Int[np.ndarray, " F"], place: _Place, rival: _Place
-) -> float:
+def rival_score(frames: Sequence[Evidence], block: np.ndarray, place: _Place, rival: _Place) -> float:
     """By how many sigmas of the scenes' scatter frames prefer a pose to its rival; infinite where both are one peak."""
     if float(rotation_angle_rad(place[0] @ inverse(rival[0]))) < APART_RAD:
         return float("inf")

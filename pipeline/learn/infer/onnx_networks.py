@@ -23,10 +23,10 @@ from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
 from pipeline.core.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.core.errors import ConfigError, ModelError
+from pipeline.learn.infer.asking import FrameAnswer
 from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.joint_day import Evidence
 from pipeline.learn.infer.radar_evidence import RadarEvidence
-from pipeline.learn.infer.vehicle_day import FrameAnswer
 from pipeline.learn.sample.frame_sample import About, class_likelihood, sensor_row
 from pipeline.learn.sample.grid import EVIDENCE, Grid, NetworkConfig
 from pipeline.learn.sample.rendering import FrameSensors, frame_sensors, object_points, render_frame
@@ -117,9 +117,7 @@ class OnnxNetwork:
         # Why its card does not allow it to be used (empty if it does), and the bias of all answers by pair.
         self.unfit, self.bias_sigma = _read_card(path, self.metadata.get("card", "{}"))
         self._prepare = _prepare_for(self.config.grid, prepare or PrepareConfig())
-        model = onnx.shape_inference.infer_shapes(
-            model, data_prop=True
-        )  # for all parts at once: it takes most
+        model = onnx.shape_inference.infer_shapes(model, data_prop=True)  # once for all parts: it takes most
         once, by_pass = split_graph(model, "camera", _ANSWERS)
         self._learned = listed_weights(model) if WEIGHTS in self.metadata else {}
         threads = self._learn.threads

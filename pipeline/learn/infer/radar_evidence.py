@@ -75,11 +75,8 @@ class RadarEvidence:
         self, T_lidar_radar: Float[np.ndarray, "4 4"]
     ) -> tuple[Float[np.ndarray, " 1"], Float[np.ndarray, "1 6"]]:
         """Mean log-likelihood of the detections, and its gradient by a left twist (per rad, per m)."""
-        found = np.zeros(7)
-        _score(
-            self.detections_m, self.weight, self.objects, self.density, 1 / self.width, self.floor,
-            T_lidar_radar[:3], found,
-        )  # fmt: skip
+        found, seen = np.zeros(7), (self.detections_m, self.weight, self.objects, self.density)
+        _score(*seen, 1 / self.width, self.floor, T_lidar_radar[:3], found)
         return found[:1], found[None, 1:]
 
 

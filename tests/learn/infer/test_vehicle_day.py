@@ -13,8 +13,10 @@ from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError, ModelError, SolveError
 from pipeline.core.rigs import CameraPrior
 from pipeline.learn.export.onnx_file import export_onnx
+from pipeline.learn.infer.asking import FrameAnswer
 from pipeline.learn.infer.onnx_networks import UNFIT, model_files, models_key, open_networks
-from pipeline.learn.infer.vehicle_day import FrameAnswer, _travel, single_frame_solution, solve_by_networks
+from pipeline.learn.infer.single_frame import single_frame_solution
+from pipeline.learn.infer.vehicle_day import _travel, solve_by_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.grid import NetworkConfig
